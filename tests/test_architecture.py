@@ -34,9 +34,10 @@ FLOWS = {
     """,
     "sysid": """
         sentences
-        initial_state recording unknowns noise prediction runs assumptions problem first_samples
+        initial_state recording unknowns noise prediction runs alternatives assumptions problem
+        first_samples
         synthetic fit plan prechecks
-        residual_tests colour refits assumption_tests new_fits sensitivity suspects estimate
+        residual_tests colour assumption_tests search sensitivity suspects estimate
         result profile conclusion identification compare
         planner columns configuration measured design figures report .
     """,

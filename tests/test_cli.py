@@ -264,7 +264,7 @@ def test_an_interrupt_among_the_assumptions_draws_nothing(folder, monkeypatch, c
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchsoft.sysid.refits.difference", interrupted)
+    monkeypatch.setattr("torchsoft.sysid.sensitivity.difference_column", interrupted)
     recorded(folder / "data.csv", 42)
     assert identify() == 130
     assert {*os.listdir("out")} == {"answer.json", "unfinished"}

@@ -13,7 +13,6 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -37,17 +36,15 @@ from torchsoft.sysid import (
 from torchsoft.sysid import report as sections
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.estimate import Number, estimates
-from torchsoft.sysid.figures import direction_name, estimates_figure
 from torchsoft.sysid.fit import Combination, Fit
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import FailedRun
-from torchsoft.sysid.report import report, traces
-from torchsoft.sysid.result import ChannelNoise, checksum, recorded_rigs, schema
+from torchsoft.sysid.problem import Reading
+from torchsoft.sysid.report import figure, report
+from torchsoft.sysid.result import ChannelNoise, checksum, recorded_rigs
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
 
-SCHEMA = Path(__file__).parents[1] / "docs" / "answer.schema.json"
-PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
 BASE = PAPER.override({"pad.elements_x": 60, "pad.elements_y": 1, "contact.v_s": 0.05})
 E, NU, FRICTION = "materials.rubber.E", "materials.rubber.nu", "laws.steel_on_rubber.friction"
 K_N, R_N = "laws.steel_on_rubber.K_n", "laws.steel_on_rubber.R_n"
@@ -216,19 +213,13 @@ def example(kind: Any) -> Any:
     return tuple(example(one) for one in inner if one is not Ellipsis)
 
 
-def test_what_is_saved_comes_back_and_is_what_the_published_schema_says(full, path, tmp_path):
-    published = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    assert published == schema(), f"write it anew: {PUBLISH}"
+def test_what_is_saved_comes_back(full, path, tmp_path):
     whole = example(IdentificationResult)
     whole.save(tmp_path / "answer.json")
-    check = jsonschema.Draft202012Validator(schema())
     for one, file in ((full, path), (whole, tmp_path / "answer.json")):
         text = file.read_text(encoding="utf-8")
         content = json.loads(text)
-        assert [error.message for error in check.iter_errors(content)] == []
-        assert not check.is_valid(content | {"more": 1})
-        content["estimates"][0]["seen"] = "yes"
-        assert [[*e.path] for e in check.iter_errors(content)] == [["estimates", 0, "seen"]]
+        assert content["verdict"] == one.verdict
         answer = load_answer(file)
         assert answer.to_json() == text == one.to_json()
         assert answer.table() == one.table()
@@ -401,7 +392,7 @@ def test_the_page_stands_alone(page):
     tags = {tag for tag, _ in page.tags}
     assert tags.isdisjoint({"script", "link", "iframe", "object", "b", "a"})
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) > len(DEPTHS) * len(SENSORS)
+    assert len(pictures) == len(DEPTHS) * len(SENSORS)
     for attributes in pictures:
         kind, _, data = str(attributes["src"]).partition(",")
         png = base64.b64decode(data)
@@ -429,8 +420,6 @@ def test_the_page_holds_what_the_answer_holds(page, full):
         f"only {E} / {K_N}^0.5 is determined (2 %), not each ({E} 30 %, {K_N} 40 %)\n",
     ):
         assert shown in text
-    for name in (direction_name(d) for d in full.directions if not d.identifiable):
-        assert f"\n{name} may change without a trace in the data\n" in page.text
 
 
 def test_warnings_come_first_then_parameters_starts_and_sensors(page, full):
@@ -455,27 +444,16 @@ def test_assumptions_that_matter_stand_open_and_others_are_folded(page):
     assert "\n+5 ± 1.2 %\ndiffers by more than chance; other suspects explain more\n" in page.text
 
 
-def test_traces_are_those_of_the_model_and_whitened_by_its_noise(problem, result, full):
-    drawn, lost = traces(full, problem, None)
-    assert not lost
+def test_the_page_draws_the_readings_of_the_model(problem, full, tmp_path, monkeypatch):
+    drawn = list[Reading]()
+    monkeypatch.setattr(sections, "figure", lambda one, unit: drawn.append(one))
+    monkeypatch.setattr(sections, "png", lambda figure: "")
+    written(full, problem, tmp_path)
     assert len(drawn) == len(DEPTHS) * len(SENSORS)
-    runner, x = Runner(problem.recordings), np.array(result.x)
-    own = problem.residuals(runner, x, problem.names, result.made_by["rtol"]).r
-    r = np.concatenate([one.residual for one in drawn])
+    runner, x = Runner(problem.recordings), np.array(full.x)
+    own = problem.residuals(runner, x, problem.names, full.made_by["rtol"]).r
+    r = np.concatenate([one.r for one in drawn])
     np.testing.assert_array_equal(r, own[: problem.samples()])
-    fitted = {(one.recording, one.channel): one.rms for one in result.residuals}
-    for one in drawn:
-        noise, rms = SENSORS[one.channel].noise, float(np.sqrt(np.mean(one.residual**2)))
-        np.testing.assert_allclose(one.predicted - one.measured, noise * one.residual, atol=1e-12)
-        if one.recording == "held":
-            nrmse = rms * noise / np.ptp(one.measured)
-            assert nrmse == pytest.approx(result.heldout["held"][one.channel], rel=1e-6)
-        else:
-            assert rms == pytest.approx(fitted[one.recording, one.channel], rel=1e-6)
-        white = one.residual.copy()
-        if one.channel == "effort_y":
-            white = np.append(white[0] / NOISE.sd, (white[1:] - 0.8 * white[:-1]) / 0.7)
-        np.testing.assert_allclose(one.white, white, rtol=1e-9, atol=1e-9)
 
 
 def test_an_answer_to_other_data_is_rejected(problem, result, tmp_path):
@@ -504,18 +482,19 @@ def test_a_lost_recording_is_named(problem, result, tmp_path, monkeypatch):
     assert "\nAssumptions\n" not in page.text  # where there is nothing to report
 
 
-def test_no_text_of_a_picture_is_cut_or_overlaps(full):
-    figure = estimates_figure(full.estimates)
-    canvas = FigureCanvasAgg(figure)
+def test_no_text_of_a_picture_is_cut_or_overlaps():
+    t, e = np.linspace(0.0, 1.0, 50), np.ones(50)
+    drawn_one = figure(Reading(HOSTILE, t, 0.0123 * t, 0.0123 * t, None, {}, 50 * t, e), "m")
+    canvas = FigureCanvasAgg(drawn_one)
     canvas.draw()
-    texts = [one for one in figure.findobj(Text) if one.get_visible() and one.get_text().strip()]
-    for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+    texts = [one for one in drawn_one.findobj(Text) if one.get_visible() and one.get_text().strip()]
+    for axis in (axis for axes in drawn_one.axes for axis in (axes.xaxis, axes.yaxis)):
         low, high = sorted(axis.get_view_interval())  # some ticks are there but not drawn
         ticks = [one for one in axis.get_major_ticks() if not low <= one.get_loc() <= high]
         beyond = [one.label1 for one in (*ticks, *axis.get_minor_ticks())]
         texts = [one for one in texts if one not in beyond]
     drawn = [one.get_window_extent(canvas.get_renderer()) for one in texts]
-    width, height = figure.canvas.get_width_height()
+    width, height = drawn_one.canvas.get_width_height()
     assert len(drawn) > 5
     for i, box in enumerate(drawn):
         assert min(box.x0, box.y0, width - box.x1, height - box.y1) > -1, texts[i]

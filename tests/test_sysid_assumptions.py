@@ -1,5 +1,5 @@
-"""Variations of a recording: each does what it says, by closed forms and by invariances; readings
-behind a low-pass."""
+"""Alternatives to a recording: each does what it states, by closed forms and by invariances;
+readings behind a low-pass."""
 
 from dataclasses import replace
 from functools import cache
@@ -12,12 +12,13 @@ from conftest import COARSE, PAPER, RUBBER, dry, excited, stroked
 
 from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Reference, Rig
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.assumptions import AMOUNTS, assumptions
+from torchsoft.sysid.assumptions import AMOUNTS, Suspect, suspects
+from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.prediction import Prediction, Readout, Signals, Term, lagged, predict
 from torchsoft.sysid.problem import DIFFERENCE
 from torchsoft.sysid.recording import Grid, extended
-from torchsoft.sysid.refits import assuming, start_under
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.search import free
 
 E, MU_K = "materials.rubber.E", "laws.steel_on_rubber.friction.mu_k"
 SENSORS = {"x_C": Sensor(noise=1e-5), "effort_x": Sensor(noise=0.1), "effort_y": Sensor(noise=0.1)}
@@ -25,19 +26,24 @@ FINER = {"pad.elements_x": 120, "pad.elements_y": 4}
 STROKES = stroked(travel=8e-3, stroke_time=0.15, duration=0.4, grasp=0.15, since=0.2)
 
 
-def run_of(recording: Recording, derived: bool = False, /) -> Prediction:
+EFFORTS = {"x": 5.0, "y": 60.0}
+
+
+def run_of(recording: Recording) -> Prediction:
     return predict(recording.run_context(), {}, recording.grid(True), (), 1e-6)
 
 
-def variation(recording: Recording, name: str, sensors: dict[str, Sensor] | None = None) -> Any:
-    """The assumption of that name, with its variation."""
-    every = assumptions([recording], {E}, SENSORS if sensors is None else sensors)
+def suspect(recording: Recording, name: str, sensors: dict[str, Sensor] | None = None) -> Suspect:
+    """The suspect of that name."""
+    every = suspects([recording], {E}, SENSORS if sensors is None else sensors, EFFORTS)
     return next(one for one in every if one.name == name)
 
 
-def varied(recording: Recording, name: str, amount: float) -> Any:
-    """The recording with an assumption varied by an amount, in the unit of its test."""
-    return variation(recording, name).vary(recording, amount, run_of)
+def changed(recording: Recording, name: str, amount: float, **how: Any) -> Any:
+    """The recording changed by an amount [SI]."""
+    change = suspect(recording, name, **how).change
+    assert change is not None
+    return change(recording, amount)
 
 
 @cache
@@ -57,7 +63,8 @@ def thrown() -> Recording:
     )  # fmt: skip
     y0 = rig.state(disc={"x": 0.01, "y": 2.0, "v_x": 0.3, "v_y": 1.0, "omega": 20.0})
     t = np.linspace(0.0, 0.2, 21)
-    return Recording("flight", rig, {"x_disc": (t, 0 * t)}, Known(y0))
+    samples = dict.fromkeys(("x_disc", "y_disc"), (t, 0 * t)) | {"theta_disc": (t, 20.0 * t)}
+    return Recording("flight", rig, samples, Standing.of(rig, y0, lead=0.0))
 
 
 def test_a_recording_starts_where_its_rig_does():
@@ -77,18 +84,20 @@ def test_a_recording_starts_where_its_rig_does():
 def test_a_body_whose_mass_is_off_its_contour_flies_about_its_centre_of_mass(c):
     """Which goes on a parabola, while the spin stays what it is."""
     flight, axis = thrown(), "x" if c[0] else "y"
-    made = varied(flight, f"bodies.disc.centre_{axis}", 1e3 * sum(c))
+    made = changed(flight, f"bodies.disc.centre_{axis}", sum(c))
     at = run_of(made)
-    named = dict(zip(made.channels, at.signals.T))
-    angle, t = 20.0 * at.t, at.t[:, None]
+    found = dict(zip(made.channels, at.signals.T))
+    t, offset = at.t, np.array(c)[:, None]
+    speed = [0.3 - 20.0 * c[1], 1.0 + 20.0 * c[0]]
+    exact = [0.01 + c[0] + speed[0] * t, 2.0 + c[1] + speed[1] * t - 0.5 * 9.81 * t**2]
+    np.testing.assert_allclose([found["x_disc"], found["y_disc"]], exact, atol=1e-9)
+    np.testing.assert_allclose(found["theta_disc"], 20.0 * t, atol=1e-5)
+    times, angle = flight.samples["theta_disc"]
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    start = np.array([0.01, 2.0]) + c
-    speed = np.array([0.3, 1.0]) + 20.0 * np.array([-c[1], c[0]])
-    mass_centre = start + speed * t + 0.5 * np.array([0.0, -9.81]) * t**2
-    exact = mass_centre - np.einsum("ijt,j->ti", R, c)
-    found = np.stack([named["x_disc"], named["y_disc"]], -1)
-    np.testing.assert_allclose(found, exact, atol=1e-3 * np.linalg.norm(c))
-    np.testing.assert_allclose(named["theta_disc"], angle, atol=1e-5)
+    shift = [made.samples[name][1] - flight.samples[name][1] for name in ("x_disc", "y_disc")]
+    np.testing.assert_allclose(shift, (R * offset[None]).sum(1), atol=1e-12)
+    blind = replace(flight, samples={"x_disc": (times, 0 * times)})
+    assert changed(blind, f"bodies.disc.centre_{axis}", sum(c)) is None
 
 
 @pytest.mark.parametrize(("parameter", "late"), [("actuators.lag", "xy"), ("actuators.y.lag", "y")])
@@ -114,16 +123,16 @@ def test_a_controller_that_is_late_pushes_behind_a_low_pass(parameter, late):
 
 @pytest.mark.parametrize("name", ["x", "y"])
 def test_a_limit_cuts_the_largest_efforts_off(name):
-    """By a part of the largest one without it, and no other effort, with what that does later."""
+    """By a part of the largest one, and no other effort, with what that does later."""
     channel = strokes().channels.index(f"effort_{name}")
-    without, cut = (
-        run_of(varied(strokes(), f"limit of the controller {name}", part)).signals[:, channel]
-        for part in (0.0, 10.0)
-    )
-    np.testing.assert_allclose(without, run_of(strokes()).signals[:, channel], atol=1e-3)
-    most = 0.9 * np.abs(without).max()
-    assert np.abs(cut).max() == pytest.approx(most, rel=1e-4)
-    first = np.flatnonzero(np.abs(without) > most)[0]
+    without = run_of(strokes()).signals[:, channel]
+    largest = float(np.abs(without).max())
+    every = suspects([strokes()], {E}, SENSORS, {name: largest})
+    (limit,) = (one for one in every if one.name == f"limit of the controller {name}")
+    assert limit.change is not None
+    cut = run_of(limit.change(strokes(), 0.1)).signals[:, channel]  # pyright: ignore[reportArgumentType]
+    assert np.abs(cut).max() == pytest.approx(0.9 * largest, rel=1e-4)
+    first = np.flatnonzero(np.abs(without) > 0.9 * largest)[0]
     np.testing.assert_allclose(cut[:first], without[:first], atol=1e-3)
 
 
@@ -139,52 +148,49 @@ def test_pads_keep_their_faces_and_first_ends_or_turn_about_the_middle(name):
     pad, at = stated.rig.pads[name], face(stated, name)
     for extent in ("height", "length"):
         for who in (f"the pad {name}", "pads"):
-            other = varied(stated, f"{extent} of {who}", 2.0)
+            other = changed(stated, f"{extent} of {who}", 0.02)
             new = other.rig.pads[name]
             assert getattr(new.mesh, extent) == pytest.approx(1.02 * getattr(pad.mesh, extent))
             np.testing.assert_allclose(face(other, name)[0], at[0], atol=1e-15)
             assert new.material.E is not pad.material.E
-    turned = face(varied(stated, f"tilt of the pad {name}", 5.0), name)
+    turned = face(changed(stated, f"tilt of the pad {name}", 5e-3), name)
     np.testing.assert_allclose(turned.mean(0), at.mean(0), atol=1e-15)
     slope = (turned[-1, 1] - turned[0, 1]) / (turned[-1, 0] - turned[0, 0])
     assert slope == pytest.approx(np.tan(5e-3))
-    nearer = face(varied(stated, f"place of the pad {name}", 100.0), name) - at
+    nearer = face(changed(stated, f"place of the pad {name}", 1e-4), name) - at
     np.testing.assert_allclose(nearer, np.broadcast_to([0.0, up], nearer.shape), atol=1e-15)
-    fine = varied(stated, "mesh", 1.0).rig.pads[name]
+    fine = changed(stated, "mesh", 1.0).rig.pads[name]
     assert (fine.mesh.elements_x, fine.mesh.elements_y, fine.points) == (120, 4, pad.points)
-    assert varied(stated, "contact points", 1.0).rig.pads[name].points == pad.points + 2
+    assert changed(stated, "contact points", 1.0).rig.pads[name].points == pad.points + 2
     np.testing.assert_allclose(fine.positions[[0, -1]], pad.positions[[0, -1]], atol=1e-15)
-    step = face(varied(stated, "mesh phase", 1.0), name) - at
+    step = face(changed(stated, "mesh phase", 1.0), name) - at
     np.testing.assert_allclose(np.abs(step[:, 0]), 0.25 * pad.mesh.length / 60, rtol=1e-9)
 
 
-def test_springs_that_follow_the_pads_follow_those_of_a_variation():
+def test_springs_that_follow_the_pads_follow_those_of_an_alternative():
     coarse, finer = (
         PAPER.override(COARSE | {"contact.K_n": "auto"} | more).assemble() for more in ({}, FINER)
     )
     coarse.reference = strokes().rig.reference
-    made = varied(replace(strokes(), rig=coarse), "mesh", 1.0).rig
+    made = changed(replace(strokes(), rig=coarse), "mesh", 1.0).rig
     stated, found, built = (rig.contacts["U"].law.K_n.item() for rig in (coarse, made, finer))
     assert found == pytest.approx(built)
     assert found > 1.5 * stated
 
 
 def test_a_run_from_a_state_of_the_pads_has_no_other_pads():
+    known = replace(thrown(), start=Known(thrown().run_context().y0({})))
     for name in ("tilt of the pad floor", "height of the pad floor", "mesh"):
-        assert varied(thrown(), name, 1.0) is None
+        assert changed(known, name, 0.1) is None
 
 
-def test_a_channel_reads_a_part_of_another_and_a_camera_has_a_scale():
+def test_a_camera_has_a_scale_about_zero_or_its_first_sample():
     data, places = strokes(), {**SENSORS, "y_Br": Sensor(noise=1e-5)}
-    (_, x), (_, fy) = data.samples["x_C"], data.samples["effort_y"]
-    crossed, scaled = (
-        variation(data, name, places).read
-        for name in ("crosstalk effort_y to effort_x", "scale of the camera")
-    )
-    np.testing.assert_allclose(crossed(data, "effort_x", 2.0), -0.02 * fy)
-    assert not crossed(data, "effort_y", 2.0).any()
-    np.testing.assert_allclose(scaled(data, "x_C", 1.0), -0.01 * (x - x[0]))
-    assert not scaled(data, "effort_x", 1.0).any()
+    _, x = data.samples["x_C"]
+    for name, zero in (("scale of the camera", 0.0), ("scale about the start of the camera", x[0])):
+        samples = changed(data, name, 0.01, sensors=places).samples
+        np.testing.assert_allclose(samples["x_C"][1], x - 0.01 * (x - zero))
+        assert samples["effort_x"] is data.samples["effort_x"]
 
 
 def test_a_camera_that_is_turned_mixes_coordinates_about_their_first_samples():
@@ -197,56 +203,66 @@ def test_a_camera_that_is_turned_mixes_coordinates_about_their_first_samples():
         "y_disc": (late, 2.0 - 3.0 * c * late - s * late),
     }
     data = replace(thrown(), samples=seen)
-    turned = variation(data, "angle of the camera on disc", dict.fromkeys(seen, Sensor(noise=1e-5)))
-    for channel, (at, y) in seen.items():
-        lost = turned.read(data, channel, 1.0)
-        np.testing.assert_allclose(y + lost, path[channel](at), atol=4e-6)
+    sensors = dict.fromkeys(seen, Sensor(noise=1e-5))
+    turned = changed(data, "angle of the camera on disc", 1e-3, sensors=sensors).samples
+    for channel, (at, _) in seen.items():
+        np.testing.assert_allclose(turned[channel][1], path[channel](at), atol=4e-6)
 
 
 def test_what_is_unknown_is_not_taken_for_granted():
     some = {"bodies.disc.shape.radius", "start.disc.x", "bias of x_C"}
     names, left = (
-        {one.name for one in assumptions([strokes()], unknown, SENSORS)}
+        {one.name for one in suspects([strokes()], unknown, SENSORS, EFFORTS)}
         for unknown in (set(), some)
     )
     assert names - left == {"bodies.disc.shape.radius", "start of disc.x", "bias x_C"}
 
 
-def test_a_number_is_varied_as_far_as_there_is_a_rig():
+def test_a_number_is_free_as_far_as_there_is_a_rig():
     """Friction in slip must not exceed that at rest."""
     first = strokes()
-    data = replace(first, rig=changed(first, MU_K, 0.795))
-    one = variation(data, MU_K)
-    c = assuming(Problem([data], SENSORS, {E: Unknown()}), [one], free=True).coordinates
+    data = replace(first, rig=with_value(first, MU_K, 0.795))
+    one = suspect(data, MU_K)
+    c = free(Problem([data], SENSORS, {E: Unknown()}), one).coordinates
     sliding = next(a for a in c.all if a.name == MU_K)
     reach = AMOUNTS * one.step / one.nominal
     assert sliding.low == pytest.approx((1 - reach) * 0.795)
     assert 0.795 < sliding.high < 0.8 < (1 + reach) * 0.795
 
 
-def test_amounts_of_variations_are_coordinates_with_differences_as_derivatives():
-    """Held at zero they change nothing; at an amount residuals are those of the varied recording,
-    and the column of a free one is a difference by a part of its amount."""
+def test_amounts_of_alternatives_are_coordinates_with_differences_as_derivatives():
+    """At zero they change nothing; at an amount residuals are those of the changed recording, and
+    the column of a free one is a difference by a part of its amount."""
     data = strokes()
     problem, runner = Problem([data], SENSORS, {E: Unknown()}), Runner([data])
-    chosen = [variation(data, n) for n in ("height of pads", "crosstalk effort_y to effort_x")]
-    other = assuming(problem, chosen, free=True)
+    one = suspect(data, "height of pads")
+    other = free(problem, one)
     c, which, start = other.coordinates, problem.names, problem.coordinates.start
-    assert c.labels == (E, *(one.name for one in chosen))
+    assert c.labels == (E, one.name)
     base = problem.residuals(runner, start, which, 1e-4)
-    x = start_under(other, chosen, {E: start[0]})
+    x = c.with_known({E: start[0]})
     at = other.residuals(other.runner(runner), x, which, base.steps, c.free)
     np.testing.assert_allclose(at.r, base.r, atol=1e-6)
-    thicker = varied(data, "height of pads", DIFFERENCE)
+    thicker = changed(data, one.name, DIFFERENCE * one.step)
     own = Problem([thicker], SENSORS, {E: Unknown()})
     moved = own.residuals(Runner([thicker]), start, which, base.steps)
-    change = at.J[:, 1] * c.all[1].to_x(DIFFERENCE)
+    change = at.J[:, 1] * c.all[1].to_x(DIFFERENCE * one.step)
     np.testing.assert_allclose(change, moved.r - base.r, rtol=1e-9, atol=1e-9)
-    rows = len(data.samples["effort_x"][0])
-    column = at.J[rows : 2 * rows, 2] * c.all[2].to_x(0.1)
-    np.testing.assert_allclose(column, 1e-2 * data.samples["effort_y"][1], rtol=1e-6, atol=1e-9)
-    held = assuming(problem, chosen, free=False)
-    assert held.coordinates.free.tolist() == [True, False, False]
+    assert free(problem, one, held=True).coordinates.free.tolist() == [True, False]
+
+
+def test_an_alternative_of_the_samples_changes_what_is_compared():
+    data = strokes()
+    sensors = {**SENSORS, "y_C": Sensor(noise=1e-5)}
+    data = replace(data, samples=data.samples | {"y_C": data.samples["x_C"]})
+    problem, runner = Problem([data], sensors, {E: Unknown()}), Runner([data])
+    other = free(problem, suspect(data, "scale of the camera", sensors))
+    c, which = other.coordinates, problem.names
+    x = c.with_known({E: problem.coordinates.start[0]})
+    at = other.residuals(other.runner(runner), x, which, 1e-3, c.free)
+    rows = len(data.samples["x_C"][0])
+    column = at.J[:rows, 1] * c.all[1].to_x(1e-3)
+    np.testing.assert_allclose(column, 1e-3 * data.samples["x_C"][1] / 1e-5, rtol=1e-6)
 
 
 NOISE = 0.02
@@ -309,17 +325,18 @@ def test_a_low_pass_and_backlash_have_closed_forms():
     np.testing.assert_allclose(by["drift"], times - middle, atol=1e-12)
 
 
-def test_a_number_that_recordings_state_otherwise_is_varied_in_each():
+def test_a_number_that_recordings_state_otherwise_is_changed_in_each():
     first, mass = strokes(), "bodies.disc.mass"
-    other = replace(first, name="other", rig=changed(first, mass, 0.5))
-    (one,) = (v for v in assumptions([first, other], {E}, SENSORS) if v.name == mass)
+    other = replace(first, name="other", rig=with_value(first, mass, 0.5))
+    (one,) = (v for v in suspects([first, other], {E}, SENSORS, {}) if v.name == mass)
     assert not one.parameter
-    assert one.vary is not None
-    made = [one.vary(r, 2.0, run_of).parameters[mass] for r in (first, other)]
-    np.testing.assert_allclose(made, [1.02 * first.parameters[mass], 1.02 * 0.5])
+    assert one.change is not None
+    made = [one.change(r, 0.02) for r in (first, other)]
+    found = [r.parameters[mass] for r in made if r is not None]
+    np.testing.assert_allclose(found, [1.02 * first.parameters[mass], 1.02 * 0.5])
 
 
-def changed(recording: Recording, name: str, value: float) -> Rig:
+def with_value(recording: Recording, name: str, value: float) -> Rig:
     rig = recording.run_context().rig
     with torch.no_grad():
         rig.parameter(name).fill_(value)
@@ -329,11 +346,11 @@ def changed(recording: Recording, name: str, value: float) -> Rig:
 @pytest.mark.slow
 def test_linear_pads_at_finite_strain_are_those_of_a_neo_hookean_file():
     """With the same names of numbers, of which both pads have one."""
-    made = varied(strokes(), "finite strain", 1.0)
+    made = changed(strokes(), "finite strain", 1.0)
     built = replace(strokes("neo_hookean"), start=strokes().start)
     built.rig.reference = strokes().rig.reference
     assert made.parameters == built.parameters
-    again = {one.name for one in assumptions([made], {E}, SENSORS)}
+    again = {one.name for one in suspects([made], {E}, SENSORS, EFFORTS)}
     assert "finite strain" not in again
     grid = made.grid(False)
     one, other = (predict(r.run_context(), {E: 0.8e6}, grid, (), 1e-3) for r in (made, built))

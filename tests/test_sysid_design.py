@@ -23,7 +23,7 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 from torchsoft.sysid.configuration import read_config
 from torchsoft.sysid.design import AS_STATED, design, planned, rank
-from torchsoft.sysid.planner import LEFT, Optimality, Planner, chosen, deviations, optimality
+from torchsoft.sysid.planner import LEFT, Optimality, Planner, chosen, optimality
 from torchsoft.sysid.runs import Runner
 
 P, DEPTH = PAPER.override(COARSE), 1e-3
@@ -47,7 +47,7 @@ BOUNDS = {
 }
 SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "effort_y")}
 BOTH = {E: Unknown(), K_N: Unknown()}
-KINDS: tuple[Optimality, ...] = ("D", "A", "worst")
+KINDS: tuple[Optimality, ...] = ("D", "A")
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def jacobian(problem: Problem) -> np.ndarray:
 def stated_deviations(problem: Problem) -> dict[str, float]:
     J = jacobian(problem)
     names, T = chosen(problem, problem.coordinates.start, None)
-    return deviations(names, T, np.linalg.inv(J.T @ J))
+    return dict(zip(names, np.sqrt(np.diag(T @ np.linalg.inv(J.T @ J) @ T.T)).tolist()))
 
 
 @pytest.mark.parametrize("criterion", KINDS)
@@ -94,23 +94,23 @@ def test_slopes_are_those_of_differences(plan, monkeypatch):
     beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
     faulty = {"effort_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}
-    one = planner(stated := Problem([plan], SENSORS | faulty, BOTH), F_y=(-30.0, 30.0))
-    z, x = one.moves.start, stated.coordinates.start
-    at = one.evaluate(z, x)
+    one = planner(Problem([plan], SENSORS | faulty, BOTH), F_y=(-30.0, 30.0))
+    z = one.moves.start
+    at = one.evaluate(z)
     assert at.peaks["effort_y"] > 1
     direction, h = np.random.default_rng(1).standard_normal(one.moves.n), 3e-5
-    ahead, behind = (one.evaluate(z + s * h * direction, x, at.steps) for s in (1, -1))
+    ahead, behind = (one.evaluate(z + s * h * direction, at.steps) for s in (1, -1))
     wanted = (ahead.value + ahead.cost - behind.value - behind.cost) / (2 * h)
-    assert one.slopes(z, x, at) @ direction == pytest.approx(wanted, rel=1e-3)
+    assert one.slopes(z, at) @ direction == pytest.approx(wanted, rel=1e-3)
 
 
 def test_errors_of_steps_and_of_linearising_count(plan):
     """Sensors ten thousand times as good see the steps, and what a covariance promises is not
     there."""
     sensors = {name: Sensor(noise=one.noise / 4e4) for name, one in SENSORS.items()}
-    one = planner(stated := Problem([plan], sensors, BOTH))
-    at = one.evaluate(one.moves.start, stated.coordinates.start)
-    sd = np.array(list(one.deviations(stated.coordinates.start, at).values()))
+    one = planner(Problem([plan], sensors, BOTH))
+    at = one.evaluate(one.moves.start)
+    sd = np.array(list(at.deviations.values()))
     size = np.mean(sd**2 + LEFT**2 * (at.errors**2).mean(0))
     assert at.value == pytest.approx(0.5 * np.log(size))
     assert np.abs(at.errors / sd).max() > 10
@@ -189,8 +189,8 @@ def test_a_search_leaves_out_what_cannot_be_run_and_keeps_the_best_when_interrup
     monkeypatch.setattr(Planner, "evaluate", sometimes)
     monkeypatch.setattr(Planner, "slopes", interrupted)
     found = design(problem, "plan", BOUNDS, iterations=50)
-    assert any("could not be run" in notice for notice in found.notices)
-    assert "interrupted after 1 of 50 iterations" in found.notices
+    assert [one.code for one in found.findings] == ["design-interrupted", "design-failed"]
+    assert str(found.findings[0]) == "Interrupted after 1 of 50 iterations."
     lost = repeat(True)
     with pytest.raises(ValueError, match="the motion given cannot be run"):
         design(problem, "plan", BOUNDS, iterations=3)
@@ -267,7 +267,7 @@ def test_candidates_are_ranked_by_the_deviations_of_the_fisher_matrix(folder):
     stated = read_config(folder / "fit.toml")
     file = RigFile.ready("orientation").override(**stated.settings)
     twisted = file.override(**stated.design.candidates["twist"])
-    made = planned(stated, twisted, twisted.build(), "twist", stated.design.rtol, noise=0.0)
+    made = planned(stated, twisted.build(), "twist", stated.design.rtol, noise=0.0)
     problem = Problem([made], stated.sensors, stated.unknowns)
     assert first["deviations"] == pytest.approx(stated_deviations(problem), rel=1e-6)
 
@@ -284,7 +284,6 @@ def test_the_designed_motion_is_a_rig_file_that_runs(folder):
     assert max(map(abs, motion.values)) <= 0.5 + 1e-9
     first, *later = [visit["value"] for visit in written["history"]]
     assert min(later) < first
-    assert (folder / "out/design.png").stat().st_size > 10_000
     rig, y0, t = file.build()
     assert simulate(rig, t[:3], y0=y0)["x_disc"].isfinite().all()
     followed = rig.follow(torch.tensor([0.5, 0.8]).double())[:, rig.signals.index("theta_d"), 0]
@@ -303,7 +302,7 @@ def test_files_that_a_rig_names_are_found_from_elsewhere(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (replaced('rig = "orientation"', ""), "rig is missing: say rig"),
+        (replaced('rig = "orientation"', ""), "rig is missing"),
         (replaced("x_upper = ", "x_uper = "), "limits.x_uper = .* did you mean `x_upper`\\?"),
         (replaced("twist.motion", "twist.motions"), "design.candidates.twist: `motions` is not"),
         (replaced("theta_d = {low", "theta = {low"), "no Profile called `theta`"),

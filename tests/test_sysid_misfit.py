@@ -67,9 +67,8 @@ class Case:
                 raw=raw - j @ x,
                 reading=one[4],
                 noise=self.assumed,
-                whitened=(lambda rows: rows) if w is None else w.__matmul__,
             )
-            for one, raw, j, w in zip(known, rows, columns, W)
+            for one, raw, j in zip(known, rows, columns)
         ]
         return parts, y - J @ x, J
 

@@ -28,10 +28,10 @@ def test_of_a_linear_problem_the_profile_is_the_parabola_of_the_covariance(varia
         np.testing.assert_allclose(np.log(one.ci95), [-Z95 * sd[i], Z95 * sd[i]], rtol=1e-5)
         np.testing.assert_allclose(one.wald95, one.ci95, rtol=1e-6)
         assert one.values == sorted(one.values)
-        assert not one.notices
+        assert not one.findings
 
 
-def test_a_curved_profile_has_the_exact_ends_and_reports_that_the_covariance_has_others():
+def test_a_curved_profile_has_the_exact_ends():
     """(e^x - 1) / 0.3 is one residual, and p1 follows x^2: the others bend, the profile of p0 is
     known."""
     bent = ClosedForm(lambda x: [(np.exp(x[0]) - 1) / 0.3, 5 * (x[1] - x[0] ** 2)], 2)
@@ -39,7 +39,6 @@ def test_a_curved_profile_has_the_exact_ends_and_reports_that_the_covariance_has
     assert one.ci95 == pytest.approx((1 - 0.3 * Z95, 1 + 0.3 * Z95), rel=2e-3)
     np.testing.assert_allclose(one.others["p1"], np.exp(np.log(one.values) ** 2), rtol=2e-2)
     np.testing.assert_allclose(one.rises, ((np.array(one.values) - 1) / 0.3) ** 2, atol=1e-2)
-    assert any("no parabola" in notice for notice in one.notices)
 
 
 @pytest.mark.parametrize(
@@ -53,12 +52,12 @@ def test_an_end_that_does_not_exist_is_open_with_its_reason(problem, low, why):
     (one,) = profiles(optimum(problem, 0))
     assert one.ci95[1] is None
     assert one.ci95[0] == (low and pytest.approx(low, rel=1e-6))
-    assert any("no upper bound" in notice and why in notice for notice in one.notices)
+    assert any("no upper bound" in str(finding) and why in str(finding) for finding in one.findings)
 
 
 def test_a_fit_that_was_not_at_its_optimum_is_found_out():
     (one,) = profiles(optimum(ClosedForm(lambda x: [x[0] - 0.5], 1), 0))
-    assert any("fit did not end at the optimum" in notice for notice in one.notices)
+    assert any("fit did not end at the optimum" in str(finding) for finding in one.findings)
     assert one.ci95[1] is None
 
 
@@ -101,7 +100,6 @@ def test_profile_and_combination_of_stiffnesses_in_series():
     low, high = one.ci95
     assert low < 0.75e6 < high
     assert high - one.best > 1.3 * (one.best - low)
-    assert any("no parabola" in notice for notice in one.notices)
     assert (np.diff(one.others[K_N]) < 0).all()
     (both,) = combinations(o.labels, o.covariance, 0.1)
     assert both.exponents == {E: 1.0, K_N: pytest.approx(0.09, abs=0.02)}

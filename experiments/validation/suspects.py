@@ -42,7 +42,7 @@ from experiments.validation.foreign_recordings import (
     make_all,
 )
 from torchsoft.sysid import IdentificationResult, Recording, Unreachable, explain, identify
-from torchsoft.sysid.assumptions import delayed
+from torchsoft.sysid.alternatives import delayed
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import forget
 from torchsoft.sysid.suspects import LIKELY

@@ -39,11 +39,9 @@ def design(options: argparse.Namespace) -> int:
     """Choose a motion and write it."""
     config, data = sorted_files(options.files)
     from torchsoft.files import write_json
-    from torchsoft.plot.figures import save
     from torchsoft.rigs import written
     from torchsoft.sysid import measured
     from torchsoft.sysid.design import choose
-    from torchsoft.sysid.figures import design_figure
 
     stated = measured.read_config(config)
     recorded = measured.load(data, config).problem.recordings if data else ()
@@ -53,9 +51,10 @@ def design(options: argparse.Namespace) -> int:
     write_json(options.out / "design.json", chosen.summary())
     say(chosen.table())
     if chosen.found is not None:
-        save(design_figure(chosen.found), options.out / "design.png")
         say(f"\n{chosen.rated[0].name}, its knots moved:\n{chosen.found.table()}")
-        for notice in (*chosen.found.limits, *chosen.found.notices):
-            say(f"note: {notice}")
+        for limit in chosen.found.limits:
+            say(f"note: {limit}")
+        for finding in chosen.found.findings:
+            say(f"{finding.severity}: {finding}")
     say(f"written to {options.out / 'motion.toml'} and {options.out / 'design.json'}")
     return 0 if chosen.found is None or chosen.found.confirmed else 1

@@ -60,8 +60,8 @@ def profile(options: argparse.Namespace) -> int:
     for one in found:
         ends = ["open" if end is None else f"{end:.5g}" for end in one.ci95]
         say(f"{one.label:34s} {one.best:12.5g}   {' .. '.join(ends)}")
-        for notice in one.notices:
-            say(f"note: {notice}")
+        for finding in one.findings:
+            say(f"{finding.severity}: {finding}")
     path = options.out / "profile.json"
     write_json(path, [asdict(one) for one in found])
     say(f"written to {path}")

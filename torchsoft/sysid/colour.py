@@ -73,15 +73,14 @@ def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residual
     """Residuals and their Jacobian, whitened with the noise of the problem in place of that of the
     parts."""
     r, J = at.r.copy(), at.J.copy()
-    recordings = {recording.name: recording for recording in problem.recordings}
     for part in now:
-        rows = (
-            J[part.rows]
-            if part.noise is None
-            else spsolve_triangular(part.noise.whitener(part.t), J[part.rows])
+        r[part.rows], rows = part.raw, J[part.rows]
+        J[part.rows] = (
+            rows if part.noise is None else spsolve_triangular(part.noise.whitener(part.t), rows)
         )
-        r[part.rows] = problem.whitened(recordings[part.recording], part.channel, part.raw)
-        J[part.rows] = problem.whitened(recordings[part.recording], part.channel, rows)
+        if (noise := problem.noise.get(part.channel)) is not None:
+            W = noise.whitener(part.t)
+            r[part.rows], J[part.rows] = W @ r[part.rows], W @ J[part.rows]
     return at._replace(r=r, J=J)
 
 
@@ -98,17 +97,13 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
     channels = list(dict.fromkeys(part.channel for part in parts))
     for channel in channels:
         mine = [part for part in parts if part.channel == channel]
-        if any(part.saturated for part in mine):
-            continue
-        if float(np.mean(np.concatenate([part.raw for part in mine]) ** 2)) < FAINT**2:
+        every = np.concatenate([part.raw for part in mine])
+        if any(part.saturated for part in mine) or float(np.mean(every**2)) < FAINT**2:
             continue
         fitted = sum(float(np.sum(Q[part.rows] ** 2)) for part in mine)
         found = fit_noise([(part.t, part.raw) for part in mine], fitted)
-        p, ratio = (
-            found.noise.order,
-            found.scores[0].deviance - found.scores[found.noise.order].deviance,
-        )
-        tests = len(channels) * max(len(found.scores) - 1, 1)
+        p, tests = found.noise.order, len(channels) * max(len(found.scores) - 1, 1)
+        ratio = found.scores[0].deviance - found.scores[p].deviance
         if p > 0 and (channel in declared or tests * stats.chi2.sf(ratio, p) < LEVEL):
             out[channel] = found._replace(noise=found.noise.at_least(1.0))
     return out

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
-from torchsoft.display import enumerated, nearest, suggestion
+from torchsoft.display import enumerated, nearest
 from torchsoft.solve.mcap import read_log
 from torchsoft.solve.netcdf import load
 from torchsoft.sysid.recording import Array
@@ -25,54 +25,32 @@ from torchsoft.tables import shown
 
 
 class Vocabulary(NamedTuple):
-    """Columns of the recordings of a rig: `units` by column, the names of signals, what `headings`
-    of other names stand for, the angles that are `unwrapped`, and columns by their `short` names.
-    """
+    """Columns of the recordings of a rig: `units` by column, the names of signals, the column that
+    every heading stands for, and the angles that are `unwrapped`."""
 
     units: Mapping[str, str]
     signals: tuple[str, ...]
-    headings: Mapping[str, str] = {}
+    headings: Mapping[str, str]
     unwrapped: tuple[str, ...] = ()
-    short: Mapping[str, str] = {}
 
     def full(self, name: str) -> str:
-        """The column that a name stands for, itself if it is not a short one."""
-        return self.short.get(name, name)
+        """The column that a name stands for, itself if it is no heading."""
+        return self.headings.get(name, name)
 
-    @property
-    def written(self) -> dict[str, str]:
-        """Columns by headings that are not, or not only, their own."""
-        short = {a: name for a, name in self.short.items() if name not in self.headings.values()}
-        return {name: name for name in short.values()} | short | dict(self.headings)
-
-    def renamed(self, headings: Mapping[str, str], unwrapped: Collection[str]) -> "Vocabulary":
-        """With headings of other names, and with angles that are unwrapped, by their headings.
-        Raises `ValueError` for one that stands for no column, or for no angle."""
-        headings = {heading: self.full(name) for heading, name in headings.items()}
-        for heading in (*headings, *unwrapped):
-            if (name := headings.get(heading, self.full(heading))) not in self.units:
-                raise ValueError(
-                    f"columns.{heading} = {shown(name)} is no channel of the rig; "
-                    f"{suggestion(name, self.units, 'there are')}"
-                )
-            if heading in unwrapped and self.units[name] != "rad":
-                raise ValueError(
-                    f"columns.{heading}.unwrap: `{name}` is in {self.units[name]}, and only angles "
-                    "wrap: leave it out"
-                )
-        turned = tuple(headings.get(heading, self.full(heading)) for heading in unwrapped)
-        return self._replace(headings=headings, unwrapped=turned)
-
-    @property
-    def measured(self) -> tuple[str, ...]:
-        """Channels that sensors measure."""
-        rates = tuple(f"{name}_dot" for name in self.signals)
-        return tuple(name for name in self.units if name not in ("t", *self.signals, *rates))
+    def heading(self, column: str) -> str:
+        """The heading of a column."""
+        return {of: heading for heading, of in self.headings.items()}[column]
 
     @property
     def asked(self) -> tuple[str, ...]:
         """Signals and their rates."""
-        return tuple(name for name in self.units if name not in ("t", *self.measured))
+        rates = (f"{name}_dot" for name in self.signals)
+        return tuple(name for name in (*self.signals, *rates) if name in self.units)
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Channels that sensors measure."""
+        return tuple(name for name in self.units if name not in ("t", *self.asked))
 
 
 ROWS = 10
@@ -119,11 +97,8 @@ class Tables:
         return any(column in table.values for table in self.tables)
 
     def of(self, column: str) -> Columns:
-        """The table with a column. Raises `KeyError`."""
-        for table in self.tables:
-            if column in table.values:
-                return table
-        raise KeyError(column)
+        """The table with a column."""
+        return next(table for table in self.tables if column in table.values)
 
     @property
     def columns(self) -> dict[str, tuple[Array, Array]]:
@@ -138,16 +113,14 @@ class Tables:
     @property
     def first_time(self) -> float:
         """When the first sample was taken [s]."""
-        columns = {name: self.columns[name] for name in self.known.measured if name in self}
-        measured = [t[np.isfinite(y)] for t, y in columns.values()]
-        return min(
-            (float(t[0]) for t in measured if len(t)), default=float(self.tables[0].values["t"][0])
-        )
+        measured = (self.columns[name] for name in self.known.measured if name in self)
+        times = [float(t[np.isfinite(y)][0]) for t, y in measured if np.isfinite(y).any()]
+        return min(times, default=float(self.tables[0].values["t"][0]))
 
     def near(self, time: float) -> str:
         """Names the file with the set-points, and the first row at or after a time [s]."""
-        tables_of = (self.of(name) for name in self.known.signals if name in self)
-        table = next(tables_of, self.tables[0])
+        asked = (self.of(name) for name in self.known.signals if name in self)
+        table = next(asked, self.tables[0])
         return f"{table.path}, {table.near(time)}"
 
 
@@ -176,18 +149,17 @@ def read_tables(paths: Sequence[Path], ignore: Collection[str], known: Vocabular
 
 def check_times(tables: Tables) -> None:
     """Raises `ValueError` for samples that were taken where a set-point is not known."""
-    tables_of = {name: tables.of(name) for name in tables.known.signals if name in tables}
-    for name, known in tables_of.items():
+    for name in (name for name in tables.known.signals if name in tables):
+        known = tables.of(name)
         t = known.values["t"]
-        slack = float(np.diff(t).max())
         for table in tables.tables:
-            for i, where in ((0, "begins"), (-1, "ends")):
-                over = (t[0] - table.values["t"][0]) if i == 0 else (table.values["t"][-1] - t[-1])
-                if over > slack:
+            own = table.values["t"]
+            for i, over, where in ((0, t[0] - own[0], "begins"), (-1, own[-1] - t[-1], "ends")):
+                if over > np.diff(t).max():
                     raise ValueError(
-                        f"{table.at(i)}, column `t`: {table.values['t'][i]:g} s is {over:.3g} s "
-                        f"outside the times of `{name}`, which {where} at {t[i]:g} s "
-                        f"({known.path}): nothing says what was asked for then"
+                        f"{table.at(i)}, column `t`: {own[i]:g} s is {over:.3g} s outside the "
+                        f"times of `{name}`, which {where} at {t[i]:g} s ({known.path}): nothing "
+                        "says what was asked for then"
                     )
 
 
@@ -204,7 +176,7 @@ def read_table(path: Path, ignore: Collection[str], known: Vocabulary) -> Column
             y[rows] = np.unwrap(y[rows])
         elif len(turns := wraps(y[rows])):
             i = int(turns[0])
-            heading = next((one for one, of in known.headings.items() if of == name), name)
+            heading = known.heading(name)
             raise ValueError(
                 f"{table.at(int(rows[i + 1]))}, column `{heading}` jumps by a turn, from "
                 f"{y[rows[i]]:.4g} to {y[rows[i + 1]]:.4g} rad, as an angle does that wraps: say "
@@ -239,7 +211,7 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
 def read_csv(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
     """A table of numbers under `name [unit]`. Raises `ValueError` naming the row and the column."""
     units = {name: UNITS[unit] for name, unit in known.units.items()}
-    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore, known.written)
+    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore, known.headings)
     return check_table(Columns(path, table.values, table.rows, ignored=table.ignored), known)
 
 
@@ -248,9 +220,7 @@ def read_trajectory(path: Path, ignore: Collection[str], known: Vocabulary) -> C
     0. Raises `ValueError`."""
     data = read_log(path) if path.suffix == ".mcap" else load(path)
     values = read_channels(data, path, known)
-    left_out = tuple(name for name in ignore if known.full(name) in values)
-    gone = {known.full(name) for name in left_out}
-    values = {name: column for name, column in values.items() if name not in gone}
+    left_out = tuple(name for name in ignore if values.pop(known.full(name), None) is not None)
     table = Columns(path, values, list(range(len(values.get("t", ())))), "sample", left_out)
     for name, column in values.items():
         if (bad := np.flatnonzero(~np.isfinite(column))).size:
@@ -297,29 +267,27 @@ def check_table(table: Columns, known: Vocabulary) -> Columns:
                 f"{table.at(empty[0])}, column `{name}` is empty; only measured channels may have "
                 "gaps"
             )
-    apart_by = np.diff(values["t"])
-    for i in np.flatnonzero(~((apart_by > 0) & (apart_by <= (GAP if setpoints else np.inf))))[:1]:
-        t, before = values["t"][i + 1], values["t"][i]
-        if t == before:
+    t, most = values["t"], GAP if setpoints else np.inf
+    apart = np.diff(t)
+    for i in np.flatnonzero(~((apart > 0) & (apart <= most)))[:1]:
+        fault = (
+            f"{apart[i]:.3g} s are missing before it; set-points are needed every {GAP} s or "
+            "more often"
+        )
+        if apart[i] == 0:
             fault = (
-                f"the time {t:g} s is there twice: delete one of the two rows, or, if times were "
-                "rounded, write them with more digits"
+                f"the time {t[i]:g} s is there twice: delete one of the two rows, or, if times "
+                "were rounded, write them with more digits"
             )
-        elif t < before:
+        elif apart[i] < 0:
             fault = (
-                f"time goes back, from {before:g} to {t:g} s: sort the rows by time, or, if the "
-                "clock started again there, give what follows as a recording of its own"
-            )
-        else:
-            fault = (
-                f"{t - before:.3g} s are missing before it; set-points are needed every {GAP} s or "
-                "oftener"
+                f"time goes back, from {t[i]:g} to {t[i + 1]:g} s: sort the rows by time, or, if "
+                "the clock started again there, give what follows as a recording of its own"
             )
         raise ValueError(f"{table.at(i + 1)}, column `t`: {fault}")
-    finest = ROUNDED * float(np.abs(values["t"]).max())
-    for i in np.flatnonzero(apart_by < finest)[:1]:
+    for i in np.flatnonzero(apart < ROUNDED * np.abs(t).max())[:1]:
         raise ValueError(
-            f"{table.at(i + 1)}, column `t`: {values['t'][i + 1]:.9g} s is too far from zero to be "
-            "told from the time before it; count times from the start"
+            f"{table.at(i + 1)}, column `t`: {t[i + 1]:.9g} s is too far from zero to be told from "
+            "the time before it; count times from the start"
         )
     return table

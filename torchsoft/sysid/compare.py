@@ -24,7 +24,7 @@ answer is that the data cannot tell, or that no law fits.
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -43,15 +43,13 @@ from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.residual_tests import (
     Part,
+    ResidualTest,
     judge_residuals,
     parts,
     residual_findings,
 )
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
-
-# Result of a comparison
-
 
 EVIDENCE = 5.0
 """Logarithm of Bayes' factor from which evidence is very strong (Kass and Raftery 1995)."""
@@ -61,6 +59,20 @@ APART = 2.0
 
 FITS = 1e-3
 """p-value of the sum of squared residuals below which a law does not explain the data."""
+
+CLOSE = 1e-3
+"""Relative tolerance of the last fits, on the misfit and on the coordinates."""
+
+SAME = 1e-6
+"""Relative difference below which signals of two references are equal."""
+
+COLOUR = 3
+"""Largest order of the autoregression that gives the variance of a likelihood ratio its
+correlation."""
+
+
+# Result of a comparison
+
 
 Outcome = Literal["law", "cannot tell", "none fits"]
 
@@ -89,18 +101,13 @@ class LawFit:
     patterned: bool
 
     @property
-    def misses(self) -> str:
-        """Why the law does not explain the data, as the end of a sentence; empty if it does."""
+    def misses(self) -> dict[str, Any]:
+        """Facts on why the law does not explain the data; empty if it does."""
         if self.p < FITS:
-            return f"has chi2 = {self.chi2:.3g} (p = {self.p:.1g})"
+            return {"chi2": self.chi2, "p": self.p}
         if self.heldout_p is not None and self.heldout_p < FITS:
-            return f"misses the held-out recordings (p = {self.heldout_p:.1g})"
-        return "leaves residuals that follow the motion" if self.patterned else ""
-
-    @property
-    def fits(self) -> bool:
-        """Whether the law explains the fitted and the held-out recordings."""
-        return not self.misses
+            return {"heldout_p": self.heldout_p}
+        return {"patterned": "the motion"} if self.patterned else {}
 
 
 @dataclass(frozen=True)
@@ -121,46 +128,37 @@ class Versus:
     numerical: float
 
     @property
-    def doubts(self) -> list[str]:
-        """Clauses on why the other law is not refuted; empty if it is."""
-        a, b, out = f"`{self.best}`", f"`{self.other}`", []
+    def doubts(self) -> list[Finding]:
+        """Why the other law is not refuted; empty if it is."""
+        facts, out = {"best": self.best, "other": self.other}, list[Finding]()
         if self.z_heldout is not None and self.z_heldout <= -APART:
-            out.append(
-                f"held-out recordings speak for {b} and fitted ones for {a}, each by more than "
-                "noise does"
-            )
+            out.append(Finding("law-contradicted", "note", {**facts}))
         sure = self.evidence - self.numerical
         if sure < EVIDENCE or self.z < APART:
-            doubt = (
-                f"the evidence for {a} over {b} is {self.evidence:.2g} nats ({EVIDENCE:g} are "
-                f"needed), and z = {self.z:.2g} ({APART:g} is needed)"
-            )
+            numbers = {"evidence": self.evidence, "enough": EVIDENCE, "z": self.z, "apart": APART}
             if self.evidence >= EVIDENCE > sure and self.z >= APART:
-                doubt += (
-                    f", but the steps of the simulation move that by {self.numerical:.2g}: take a "
-                    "tighter tolerance"
-                )
+                numbers["numerical"] = self.numerical
             elif self.distance < 2 * APART:
-                doubt += (
-                    f"; their predictions differ by {self.distance:.2g} times the noise over all "
-                    "samples together, so that these motions and sensors cannot tell them apart"
-                )
-            out.append(doubt)
+                numbers["distance"] = self.distance
+            out.append(Finding("law-evidence", "note", facts | numbers))
         return out
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Competing laws, the best first, and the best against every other. `law` is the law named by
-    the data, if any, and `verdict` the conclusion in plain words."""
+    the data, if any, and `findings` the conclusion."""
 
     outcome: Outcome
     law: str | None
-    verdict: str
+    findings: list[Finding]
     laws: list[LawFit]
     against: list[Versus]
-    samples: int
-    heldout: list[str]
+
+    @property
+    def verdict(self) -> str:
+        """The conclusion in words."""
+        return " ".join(map(str, self.findings))
 
     def __getitem__(self, name: str) -> LawFit:
         for one in self.laws:
@@ -173,7 +171,7 @@ class Comparison:
 
     def save(self, path: str | Path) -> None:
         """Write the JSON file. It appears whole or not at all."""
-        write_json(path, asdict(self))
+        write_json(path, asdict(self) | {"verdict": self.verdict})
 
     def table(self) -> str:
         """A line for each law, with differences from the best."""
@@ -187,53 +185,33 @@ class Comparison:
         return "\n".join(rows)
 
 
-def judged(laws: list[LawFit], against: list[Versus]) -> tuple[Outcome, str | None, str]:
-    """Outcome, named law, and verdict, by the rule."""
-    best = laws[0]
-    doubts = [doubt for versus in against for doubt in versus.doubts]
-    unsure = [
-        f"the fit of `{one.name}` has not converged, so it may be better than it looks"
-        for one in laws
-        if not one.converged
-    ]
-    ahead = [v.other for v in against if not v.doubts]
-    if not best.fits:
-        verdict = f"none of the laws explains these data: the best, `{best.name}`, {best.misses}"
-        if ahead:
-            verdict += f"; it is nearer than {listed(ahead)}, but that does not make it right"
-        return (
-            "none fits",
-            None,
-            f"{verdict}. Or the noise is not as it was stated: it is larger, or coloured.",
-        )
-    if doubts or unsure:
-        return "cannot tell", None, "the data cannot tell: " + "; ".join((*doubts, *unsure)) + "."
-    sentences = [f"`{best.name}` made these data"]
-    for versus in against:
-        sentences.append(
-            f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard "
-            "deviations"
-        )
-    verdict = " ".join([". ".join(sentences) + ".", *map(str, best.left)])
-    return "law", best.name, verdict
-
-
-def listed(names: list[str]) -> str:
-    return " and ".join(f"`{name}`" for name in names)
+def judged(
+    laws: Sequence[LawFit], against: Sequence[Versus]
+) -> tuple[Outcome, str | None, list[Finding]]:
+    """Outcome, named law, and findings, by the rule."""
+    best, doubts = laws[0], [doubt for versus in against for doubt in versus.doubts]
+    refuted = [versus for versus in against if not versus.doubts]
+    if best.misses:
+        ahead = [f"`{versus.other}`" for versus in refuted]
+        facts = {"best": best.name, "ahead": ahead} | best.misses
+        return "none fits", None, [Finding("no-law", "error", facts)]
+    for one in laws:
+        if not one.converged:
+            doubts.append(Finding("law-unconverged", "note", {"law": one.name}))
+    if doubts:
+        return "cannot tell", None, [Finding("laws-alike", "warning"), *doubts]
+    cases = [{"other": one.other, "evidence": one.evidence, "z": one.z} for one in refuted]
+    facts = {"law": best.name, "cases": cases}
+    return "law", best.name, [Finding("law", "note", facts), *best.left]
 
 
 # Densities of recordings under a law
 
 
-COLOUR = 3
-"""Largest order of the autoregression that gives the variance of a likelihood ratio its
-correlation."""
-
-
 class Density(NamedTuple):
     """Predictive density of some recordings under a law: whitened residuals r (m,), s = S^-1 r with
     S = 1 + J C J' the covariance of the prediction in units of the noise, and the logarithm of the
-    samples' density in SI units."""
+    samples' density in SI units. Samples that saturation has changed are in no part."""
 
     parts: list[Part]
     r: Array
@@ -241,14 +219,13 @@ class Density(NamedTuple):
     log: float
 
     @property
+    def samples(self) -> int:
+        return sum(len(part.t) for part in self.parts)
+
+    @property
     def p(self) -> float:
         """p-value of the weighted sum of squared residuals."""
         return float(stats.chi2.sf(self.r @ self.s, self.samples))
-
-    @property
-    def samples(self) -> int:
-        """Number of samples that saturation has not changed."""
-        return sum(len(part.t) for part in self.parts)
 
 
 def density(
@@ -256,68 +233,90 @@ def density(
 ) -> Density:
     """Density of whitened residuals r (m,), with the uncertainty of the estimates in `spread` (m,
     n) = J C^(1/2)."""
-    mine, s, wider = parts(problem, r, which), r, 0.0
+    mine, s, log = parts(problem, r, which), r, 0.0
     if spread is not None:
         inner = np.eye(spread.shape[1]) + spread.T @ spread
-        s, wider = (
-            r - spread @ np.linalg.solve(inner, spread.T @ r),
-            float(np.linalg.slogdet(inner)[1]),
-        )
-    log = -0.5 * (float(r @ s) + wider)
+        s = r - spread @ np.linalg.solve(inner, spread.T @ r)
+        log = -0.5 * float(np.linalg.slogdet(inner)[1])
+    log -= 0.5 * float(r @ s)
     for one in mine:
-        log -= len(one.t) * np.log(problem.sensors[one.channel].sd * (2 * np.pi) ** 0.5)
+        log -= len(one.t) * float(np.log(problem.sensors[one.channel].sd * (2 * np.pi) ** 0.5))
         if one.noise is not None:
             log -= 0.5 * log_det(one.noise.whitener(one.t))
-    return Density(mine, r, s, float(log))
+    return Density(mine, r, s, log)
 
 
-class Evidence:
-    """Densities under a law, by its fit, of the fitted recordings and of held-out ones.
+class Evidence(NamedTuple):
+    """Densities under a law, by its fit, of the fitted recordings and of held-out ones, from runs
+    with a tenth of the fit's tolerance; `numerical` is the change that this makes. `tests` are
+    those of the residuals."""
 
-    They come from runs with a tenth of the fit's tolerance; `numerical` is the change that this
-    makes. Raises `ValueError` where a run fails.
-    """
-
-    def __init__(self, name: str, fit: Fit, heldout: Sequence[str] = ()) -> None:
-        self.name, self.fit, which, free = name, fit, fit.which, fit.free
-        problem = fit.problem
-        self.parameters = int(free.sum()) + sum(one.order + 1 for one in problem.noise.values())
-        m = problem.samples(which)
-        usual = self._at(which, fit.rtol, False).r[:m]
-        at = self._at(which, FINER * fit.rtol, True)
-        J = at.J[:, free]
-        self.fitted = density(problem, which, at.r[:m])
-        self.tests = judge_residuals(self.fitted.parts, at.r, J)
-        self.numerical = abs(0.5 * float(usual @ usual - self.fitted.r @ self.fitted.r))
-        self.dof, self.heldout = max(self.fitted.samples - int(free.sum()), 1), None
-        if heldout:
-            low, high = fit.bounds
-            F = J.T @ J + np.diag(12 / (high - low) ** 2)  # what is unknown is between its bounds
-            m, at = problem.samples(heldout), self._at(heldout, FINER * fit.rtol, True)
-            spread = np.linalg.solve(np.linalg.cholesky(F), at.J[:m, free].T).T
-            self.heldout = density(problem, heldout, at.r[:m], np.asarray(spread, np.float64))
-
-    def _at(self, which: Sequence[str], rtol: float, derivatives: bool) -> Residuals:
-        """Residuals at the estimates, and their Jacobian with `derivatives`."""
-        fit = self.fit
-        at = fit.problem.residuals(
-            fit.runner, fit.x, which, rtol, fit.free if derivatives else None
-        )
-        if at.failed:
-            raise ValueError(
-                f"the law `{self.name}` cannot be run at its estimates: {Unreachable(at.failed)}"
-            )
-        return at
+    name: str
+    fit: Fit
+    parameters: int
+    fitted: Density
+    heldout: Density | None
+    numerical: float
+    tests: list[ResidualTest]
 
     @property
     def total(self) -> float:
         """Logarithm of the density of all recordings, less Schwarz's penalty."""
-        penalty = 0.5 * self.parameters * np.log(len(self.fitted.r))
-        return (
-            self.fitted.log
-            + (self.heldout.log if self.heldout is not None else 0.0)
-            - float(penalty)
+        held = 0.0 if self.heldout is None else self.heldout.log
+        penalty = 0.5 * self.parameters * float(np.log(len(self.fitted.r)))
+        return self.fitted.log + held - penalty
+
+    def result(self) -> LawFit:
+        """Results of the law."""
+        r, k, held = self.fitted.r, self.parameters, self.heldout
+        square, dof = float(r @ r), max(self.fitted.samples - int(self.fit.free.sum()), 1)
+        return LawFit(
+            self.name,
+            k,
+            {
+                one.label: one.to_value(x)
+                for one, x in zip(self.fit.coordinates, self.fit.x[self.fit.free])
+            },
+            self.fitted.log,
+            square / dof,
+            float(stats.chi2.sf(square, dof)),
+            k * float(np.log(len(r))) - 2 * self.fitted.log,
+            None if held is None else held.log / len(held.r),
+            None if held is None else held.p,
+            self.numerical,
+            self.fit.converged,
+            residual_findings(self.tests),
+            any(test.alarming and test.test == "motion" for test in self.tests),
         )
+
+
+def evidence_of(name: str, fit: Fit, heldout: Sequence[str] = ()) -> Evidence:
+    """The evidence for a law at the end of its fit. Raises `ValueError` where a run fails."""
+    problem, free, low_high = fit.problem, fit.free, fit.bounds
+
+    def at(which: Sequence[str], rtol: float, jacobian: bool) -> tuple[Residuals, Array]:
+        """Residuals at the estimates, and those of the samples alone."""
+        got = problem.residuals(fit.runner, fit.x, which, rtol, free if jacobian else None)
+        if got.failed:
+            raise ValueError(
+                f"the law `{name}` cannot be run at its estimates: {Unreachable(got.failed)}"
+            )
+        return got, got.r[: problem.samples(which)]
+
+    _, usual = at(fit.which, fit.rtol, False)
+    fine, r = at(fit.which, FINER * fit.rtol, True)
+    fitted, J, held = density(problem, fit.which, r), fine.J[:, free], None
+    if heldout:
+        low, high = low_high
+        F = J.T @ J + np.diag(12 / (high - low) ** 2)  # what is unknown is between its bounds
+        there, r_held = at(heldout, FINER * fit.rtol, True)
+        root = np.linalg.cholesky(F)
+        spread = np.linalg.solve(root, there.J[: len(r_held), free].T).T
+        held = density(problem, heldout, r_held, np.asarray(spread, np.float64))
+    count = int(free.sum()) + sum(one.order + 1 for one in problem.noise.values())
+    numerical = abs(0.5 * float(usual @ usual - r @ r))
+    tests = judge_residuals(fitted.parts, fine.r, J)
+    return Evidence(name, fit, count, fitted, held, numerical, tests)
 
 
 class Ratio(NamedTuple):
@@ -347,12 +346,11 @@ def ratio(a: Density, b: Density) -> Ratio:
     """
     stated = variance = 0.0
     for mine, its in zip(a.parts, b.parts):
-        score = b.s[its.rows] - a.s[mine.rows]
+        other = b.s[its.rows]
         if mine.noise != its.noise:
-            other_score = (
-                b.s[its.rows] if its.noise is None else its.noise.whitener(its.t).T @ b.s[its.rows]
-            )
-            score = coloured(other_score, mine.noise, mine.t) - a.s[mine.rows]
+            other = other if its.noise is None else its.noise.whitener(its.t).T @ other
+            other = coloured(other, mine.noise, mine.t)
+        score = other - a.s[mine.rows]
         left = fit_noise([(mine.t, a.r[mine.rows])], most=COLOUR).noise
         stated += float(score @ score)
         variance += float(np.sum(coloured(score, left, mine.t) ** 2))
@@ -367,14 +365,30 @@ def coloured(score: Array, noise: Autoregression | None, t: Array) -> Array:
     return spsolve_triangular(noise.whitener(t).T.tocsr(), score, lower=False)
 
 
+def versus(best: Evidence, other: Evidence) -> Versus:
+    """The best law against another, by the rule of `torchsoft.sysid.compare`."""
+    fitted = every = ratio(best.fitted, other.fitted)
+    evidence, held = fitted.log / fitted.inflation, None
+    if best.heldout is not None and other.heldout is not None:
+        held = ratio(best.heldout, other.heldout)
+        evidence += held.log / held.inflation
+        every = Ratio(*(a + b for a, b in zip(fitted, held)))
+    more = max(best.parameters - other.parameters, 0)
+    return Versus(
+        best.name,
+        other.name,
+        fitted.log,
+        None if held is None else held.log,
+        every.stated**0.5,
+        every.inflation,
+        evidence - 0.5 * more * float(np.log(len(best.fitted.r))),
+        every.z,
+        None if held is None else held.z,
+        (best.numerical + other.numerical) / fitted.inflation,
+    )
+
+
 # Competing laws, each with its own unknowns
-
-
-SAME = 1e-6
-"""Relative difference below which signals of two references are equal."""
-
-CLOSE = 1e-3
-"""Relative tolerance of the last fits, on the misfit and on the coordinates."""
 
 
 @single_threaded()
@@ -386,7 +400,7 @@ def compare(
     rtol: float = RTOL,
     starts: int = 1,
     workers: int = 1,
-    checkpoint: str | Path | Mapping[str, str | Path] | None = None,
+    checkpoint: Mapping[str, Path] | None = None,
     progress: bool = False,
 ) -> Comparison:
     """Fit every law to the same recordings, and say which one made them, or that the data cannot
@@ -400,44 +414,39 @@ def compare(
     declares its `colour` it is found for every law, but no law may explain what it misses as noise
     that nobody declared.
 
-    Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers`
-    and the folder `checkpoint` are those of `identify`; a mapping has a folder for each law, which
-    may be that of an identification of it: what that has run is not run again. Every law but the
-    best is fitted once more from where the best one ended, as far as they share coordinates, and
-    the better end is kept: no law is to lose by its start.
+    Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts` and `workers`
+    are those of `identify`; `checkpoint` has a folder for each law, which may be that of an
+    identification of it: what that has run is not run again. Every law but the best is fitted once
+    more from where the best one ended, as far as they share coordinates, and the better end is
+    kept: no law is to lose by its start.
 
     Raises `ValueError` for laws that were not given the same data, and for a law that cannot follow
     the data.
     """
     check_alike(laws, heldout)
-    which = [name for name in next(iter(laws.values())).names if name not in heldout]
-    folders = dict(checkpoint) if isinstance(checkpoint, Mapping) else {}
-    if checkpoint is not None and not isinstance(checkpoint, Mapping):
-        folders = {name: Path(checkpoint) / name for name in laws}
     evidence = dict[str, Evidence]()
     for name, problem in laws.items():
-        own = folders.get(name)
-        runner = Runner(problem.recordings, workers, Path(own) if own is not None else None)
+        which = [one for one in problem.names if one not in heldout]
+        runner = Runner(problem.recordings, workers, (checkpoint or {}).get(name))
         start = Fit(problem, runner, problem.coordinates.start, progress=progress)
         try:
             plan = (plans or {}).get(name)
             if plan is None:
                 plan = default_plan(problem, runner, rtol, which, starts)
-            evidence[name] = Evidence(name, fitted(name, start, which, plan), heldout)
+            evidence[name] = evidence_of(name, fitted(name, start, which, plan), heldout)
         except Unreachable as error:
             raise ValueError(f"the law `{name}` cannot follow the recordings: {error}") from None
-    best = max(evidence, key=lambda name: evidence[name].total)
-    for name in (name for name in laws if name != best):
-        other = refitted(evidence[name].fit, evidence[best].fit)
-        if other is not None:
-            better = Evidence(name, other, heldout)
-            if better.fitted.log > evidence[name].fitted.log:
-                evidence[name] = better
-    first = max(evidence.values(), key=lambda one: one.total)
-    against = [versus(first, one) for one in evidence.values() if one is not first]
-    law_list = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
-    samples = len(first.fitted.r)
-    return Comparison(*judged(law_list, against), law_list, against, samples, list(heldout))
+    best = max(evidence.values(), key=lambda one: one.total)
+    for name, own in evidence.items():
+        again = None if own is best else refitted(own.fit, best.fit)
+        if again is not None:
+            evidence[name] = max(
+                own, evidence_of(name, again, heldout), key=lambda one: one.fitted.log
+            )
+    first, *others = sorted(evidence.values(), key=lambda one: -one.total)
+    against = [versus(first, one) for one in others]
+    results = [one.result() for one in (first, *others)]
+    return Comparison(*judged(results, against), results, against)
 
 
 def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
@@ -461,9 +470,7 @@ def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
             )
         for mine, its in zip(one.recordings, other.recordings):
             a, b = mine.samples, its.samples
-            if a.keys() != b.keys() or not all(
-                np.array_equal(a[c][i], b[c][i]) for c in a for i in (0, 1)
-            ):
+            if a.keys() != b.keys() or not all(np.array_equal(a[c], b[c]) for c in a):
                 raise ValueError(f"recording `{mine.name}` of {both} has other samples")
             if not same_reference(mine, its):
                 raise ValueError(
@@ -473,14 +480,10 @@ def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
 
 def same_reference(one: Recording, other: Recording) -> bool:
     """Whether the signals that both rigs have are equal."""
+    both = [name for name in one.rig.signals if name in other.rig.signals]
     t = torch.from_numpy(one.times)
-    a, b = (
-        dict(zip(r.rig.signals, r.rig.follow(t).detach()[..., 0].unbind(-1))) for r in (one, other)
-    )
-    return all(
-        float((a[k] - b[k]).abs().max()) <= SAME * float(a[k].abs().max())
-        for k in a.keys() & b.keys()
-    )
+    a, b = (r.rig.reference(t, both)[..., 0].detach() for r in (one, other))
+    return bool(((a - b).abs().amax(0) <= SAME * a.abs().amax(0)).all())
 
 
 def fitted(name: str, start: Fit, which: Sequence[str], plan: Sequence[Stage]) -> Fit:
@@ -497,8 +500,8 @@ def fitted(name: str, start: Fit, which: Sequence[str], plan: Sequence[Stage]) -
 def refitted(law: Fit, best: Fit) -> Fit | None:
     """The law fitted once more, from the estimates of another; None where they share no coordinate,
     or the fit cannot start there."""
-    x, c = law.x.copy(), best.problem.coordinates
-    known = {one.label: one.to_value(v) for one, v in zip(c.all, best.x)}
+    x, every = law.x.copy(), zip(best.problem.coordinates.all, best.x)
+    known = {one.label: one.to_value(v) for one, v in every}
     for i, one in enumerate(law.problem.coordinates.all):
         if law.free[i] and one.label in known:
             x[i] = one.to_x(float(np.clip(known[one.label], one.low, one.high)))
@@ -506,55 +509,3 @@ def refitted(law: Fit, best: Fit) -> Fit | None:
         return None
     stage = Stage("again", law.which, law.labels, law.rtol, tolerance=CLOSE)
     return continued(law._replace(x=x), stage)
-
-
-def versus(best: Evidence, other: Evidence) -> Versus:
-    """The best law against another, by the rule of `torchsoft.sysid.compare`."""
-    fitted, n = ratio(best.fitted, other.fitted), len(best.fitted.r)
-    evidence = fitted.log / fitted.inflation
-    log, stated, variance, held, z = fitted.log, fitted.stated, fitted.variance, None, None
-    if best.heldout is not None and other.heldout is not None:
-        ahead = ratio(best.heldout, other.heldout)
-        evidence, log = evidence + ahead.log / ahead.inflation, log + ahead.log
-        stated, variance = stated + ahead.stated, variance + ahead.variance
-        held, z = ahead.log, ahead.z
-    evidence -= 0.5 * max(best.parameters - other.parameters, 0) * float(np.log(n))
-    return Versus(
-        best.name,
-        other.name,
-        fitted.log,
-        held,
-        stated**0.5,
-        variance / stated if stated > 0 else 1.0,
-        evidence,
-        log / variance**0.5 if variance > 0 else 0.0,
-        z,
-        (best.numerical + other.numerical) / fitted.inflation,
-    )
-
-
-def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
-    """Results of every law."""
-    out = []
-    for name, one in evidence.items():
-        square, held = float(one.fitted.r @ one.fitted.r), one.heldout
-        c, k, n = one.fit.problem.coordinates, one.parameters, len(one.fitted.r)
-        found = zip(c.all, one.fit.x, one.fit.free)
-        out.append(
-            LawFit(
-                name,
-                k,
-                {a.label: a.to_value(x) for a, x, free in found if free},
-                one.fitted.log,
-                square / one.dof,
-                float(stats.chi2.sf(square, one.dof)),
-                k * float(np.log(n)) - 2 * one.fitted.log,
-                None if held is None else held.log / len(held.r),
-                None if held is None else held.p,
-                one.numerical,
-                one.fit.converged,
-                residual_findings(one.tests),
-                any(test.alarming and test.test == "motion" for test in one.tests),
-            )
-        )
-    return out

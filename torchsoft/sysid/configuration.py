@@ -139,13 +139,6 @@ class DesignTable(Table):
     seed: int = Field(default=0, ge=0, le=SEED)
 
 
-REPLACED = {
-    "pads": "a pad is made of a material of the rig file: say [settings.materials.NAME]",
-    "missing": "a signal without a column follows the rig file: say [settings.motion.NAME]",
-}
-"""Tables of old files, and what says it now."""
-
-
 class Config(Table):
     """An identification as a TOML file states it.
 
@@ -171,24 +164,6 @@ class Config(Table):
     heldout: Annotated[tuple[str, ...], LISTED] = ()
     ignore: Annotated[tuple[str, ...], LISTED] = ()
     acknowledged: Annotated[tuple[str, ...], LISTED] = ()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _a_rig_file_says_what_is_recorded(cls, tree: Any) -> Any:
-        if not isinstance(tree, dict):
-            return tree
-        if "rig" not in tree:
-            raise ValueError(
-                'rig is missing: say rig = "FILE.toml", the rig file whose names [settings] and '
-                '[unknowns] have, or the name of a ready rig, such as "paper"'
-            )
-        compared = tree.get("compare")
-        laws = compared.values() if isinstance(compared, dict) else ()
-        for one in (tree, *(one for one in laws if isinstance(one, dict))):
-            for field, now in REPLACED.items():
-                if field in one:
-                    raise ValueError(f"{field} is not known: {now}")
-        return tree
 
     @model_validator(mode="after")
     def _laws_have_likelihoods(self) -> "Config":

@@ -29,9 +29,19 @@ from torchsoft.sysid.measured import vocabulary
 from torchsoft.sysid.planner import PRICE, RTOL, DesignEvaluation, Optimality, Planner, Range
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.sentences import Finding
 from torchsoft.sysid.synthetic import record
 from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import line
+
+# Search of a motion by projected Adam on the smoothed criterion
+
+
+RATE = 0.03
+"""Largest move of a knot in an iteration, over the distance that speed allows between two."""
+
+SMOOTHING = 0.02
+"""Random shift of the knots, over that distance, at which the criterion is differentiated."""
 
 OUTLIER = 10.0
 """Largest gradient component, in medians; larger ones are clipped."""
@@ -60,84 +70,91 @@ class Visit:
         """The criterion with a penalty on excess."""
         return self.value + PRICE * max(0.0, self.peak - 1.0)
 
+    @classmethod
+    def of(cls, seen: DesignEvaluation, iteration: int) -> "Visit":
+        return cls(iteration, seen.value, max(seen.peaks.values(), default=0.0))
 
-class Search:
-    """Projected Adam on the smoothed criterion at coordinates x (n,). Keeps the best evaluated
-    motion. Raises `SimulationFailed` where the given motion cannot be run."""
 
-    def __init__(
-        self, planner: Planner, x: Array, rate: float, smoothing: float, seed: int
-    ) -> None:
-        self.planner, self.x, self.rate, self.smoothing = planner, x, rate, smoothing
-        self.rng, self.iteration, self.failed, self.in_a_row = np.random.default_rng(seed), 0, 0, 0
-        self.z = planner.moves.start
-        self.adam = ProjectedAdam(self.z, planner.moves.nearest, MEMORY)
-        self.seen = planner.evaluate(self.z, x)
-        self.best = self.visit(self.seen)
-        self.history = [self.best]
+class Search(NamedTuple):
+    """Outcome of a search: the coordinates of the best motion and its evaluation, those at the
+    start, the visits, and the numbers of iterations and of failed runs."""
 
-    def visit(self, seen: DesignEvaluation) -> Visit:
-        return Visit(self.iteration, seen.value, max(seen.peaks.values(), default=0.0))
+    z: Array
+    best: DesignEvaluation
+    first: DesignEvaluation
+    history: list[Visit]
+    iterations: int
+    failed: int
 
-    def evaluate(self) -> None:
-        """Evaluate the current motion, and keep it if it is the best."""
-        z, seen, visit = self.adam.z, None, Visit(self.iteration, np.inf, np.inf)
-        with suppress(SimulationFailed):
-            seen = self.planner.evaluate(z, self.x)
-            visit = self.visit(seen)
-        self.history.append(visit)
-        if seen is not None and visit.score < self.best.score:
-            self.best, self.seen, self.z = visit, seen, z
 
-    def move(self, iterations: int) -> None:
-        """Take one step, or none where the run fails."""
-        moves, z = self.planner.moves, self.adam.z
-        try:
-            shifted = moves.nearest(z + self.smoothing * self.rng.standard_normal(moves.n))
-            there = self.planner.evaluate(shifted, self.x)
-            slopes = self.planner.slopes(shifted, self.x, there)
-        except (SimulationFailed, GradientFailed):
-            self.failed, self.in_a_row = self.failed + 1, self.in_a_row + 1
-            if self.in_a_row >= FAILURES:
-                self.in_a_row, self.rate = 0, 0.5 * self.rate
-                self.adam.set(self.z)
-            return
-        self.iteration, self.in_a_row = self.iteration + 1, 0
-        most = OUTLIER * float(np.median(np.abs(slopes)))
-        part = self.iteration / iterations
-        rate = self.rate * min(1.0, self.iteration / 5) * (0.1 + 0.9 * (1 - part))
-        self.adam.step(np.clip(slopes, -most, most), rate)
-        if self.iteration % LOOK == 0:
-            self.evaluate()
+def search(planner: Planner, iterations: int, seed: int, progress: bool) -> Search:
+    """Move the knots from the motion given, and keep the best evaluated motion, also on Ctrl-C.
+    Raises `SimulationFailed` where the motion given cannot be run."""
+    moves, rng, rate = planner.moves, np.random.default_rng(seed), RATE
+    adam, z = ProjectedAdam(moves.start, moves.nearest, MEMORY), moves.start
+    first = best = planner.evaluate(z)
+    history, done, failed, in_a_row = [least := Visit.of(best, 0)], 0, 0, 0
+    with (
+        suppress(KeyboardInterrupt),
+        tqdm(total=iterations, desc="design", disable=hidden(progress)) as bar,
+    ):
+        while done < iterations:
+            try:
+                shifted = moves.nearest(adam.z + SMOOTHING * rng.standard_normal(moves.n))
+                slopes = planner.slopes(shifted, planner.evaluate(shifted))
+            except (SimulationFailed, GradientFailed):
+                failed, in_a_row = failed + 1, in_a_row + 1
+                if in_a_row >= FAILURES:
+                    in_a_row, rate = 0, 0.5 * rate
+                    adam.set(z)
+                continue
+            done, in_a_row = done + 1, 0
+            most, part = OUTLIER * float(np.median(np.abs(slopes))), done / iterations
+            warm, cool = min(1.0, done / 5), 0.1 + 0.9 * (1 - part)
+            adam.step(np.clip(slopes, -most, most), rate * warm * cool)
+            if done % LOOK == 0 or done == iterations:
+                with suppress(SimulationFailed):
+                    seen = planner.evaluate(adam.z)
+                    history.append(visit := Visit.of(seen, done))
+                    if visit.score < least.score:
+                        least, best, z = visit, seen, adam.z
+            bar.set_postfix_str(f"criterion {least.value:.3f}", refresh=False)
+            bar.update()
+    return Search(z, best, first, history, done, failed)
 
 
 # The design of a motion
 
 
 LINEARIZATION_ERROR = 1.0
-"""Largest error, in standard deviations, of a fit's Gauss-Newton step that gets no notice."""
+"""Largest error, in standard deviations, of a fit's Gauss-Newton step that is not reported."""
+
+NEAR = 0.9
+"""Fraction of its limit from which on a channel is reported."""
 
 
 @dataclass(frozen=True)
 class Design:
     """A designed motion and its information.
 
-    `recording` follows it, with noiseless samples at the nominal parameters; so does `given`, with
-    the motion at the start of the search. `before` and `after` are the relative standard deviations
-    with either, including the other recordings and priors. `history` has the criterion over the
-    search, `limits` the active constraints, `notices` other facts about the search, and
-    `confirmed` whether the rig file written of it, run again, tells the same.
+    `recording` follows it, with noiseless samples at the nominal parameters. `before` and `after`
+    are the relative standard deviations with the motion given and with it, including the other
+    recordings and priors. `history` has the criterion over the search, `limits` the active
+    constraints of the knots, `findings` other facts about the search; `confirmed` is whether the
+    rig file written of it, run again, has the same motion.
     """
 
-    given: Recording
     recording: Recording
     before: dict[str, float]
     after: dict[str, float]
     history: tuple[Visit, ...]
     limits: tuple[str, ...]
-    notices: tuple[str, ...]
+    findings: tuple[Finding, ...]
     made_by: dict[str, Any]
-    confirmed: bool = True
+
+    @property
+    def confirmed(self) -> bool:
+        return not any(one.code == "design-file" for one in self.findings)
 
     def table(self) -> str:
         """A line for each parameter."""
@@ -158,8 +175,6 @@ def design(
     criterion: Optimality = "D",
     names: Sequence[str] | None = None,
     iterations: int = 100,
-    rate: float = 0.03,
-    smoothing: float = 0.02,
     rtol: float = RTOL,
     seed: int = 0,
     workers: int = 1,
@@ -171,94 +186,69 @@ def design(
     Of the plan's samples only the times count; the other recordings and the priors contribute their
     information. Faults of sensors are nuisances, which the criterion marginalises. Beside the
     covariance it counts errors of a fit from finite steps and nonlinear samples (`Planner.errors`),
-    at the nominal values. `criterion` is "D" (the volume of the errors), "A" (their mean square) or
-    "worst". `bounds` holds the travel, speed and free knots of signals of the reference, `limits`
+    at the nominal values. `criterion` is "D" (the volume of the errors) or "A" (their mean square).
+    `bounds` holds the travel, speed and free knots of signals of the reference, `limits`
     the ranges (low, high) [unit] of channels of the run, such as forces.
 
-    The search begins with the plan's own motion. Each of the `iterations` moves knots by at most
-    about `rate` times the distance that speed allows between two, shifted at random by `smoothing`
-    times that, and takes a run with sensitivities and 2 n with the adjoint, of relative tolerance
-    `rtol`. A motion that cannot be run is skipped; on Ctrl-C the best so far is returned, with a
-    notice. Raises `ValueError` for arguments that do not fit together, and where the plan itself
-    cannot be run.
+    The search begins with the plan's own motion. Each of the `iterations` takes a run with
+    sensitivities and 2 n with the adjoint, of relative tolerance `rtol`. A motion that cannot be
+    run is skipped; on Ctrl-C the best so far is returned, with a finding. Raises `ValueError` for
+    arguments that do not fit together, and where the plan itself cannot be run.
     """
     if plan not in problem.names:
         raise ValueError(
             f"`plan` must be one of the recordings {list(problem.names)}, but is {plan!r}"
         )
-    if iterations < 0 or not 0 < rate <= 1 or not 0 <= smoothing <= 1:
-        raise ValueError(
-            "`iterations` must not be negative, `rate` and `smoothing` must be parts of 1"
-        )
-    x, recording = problem.coordinates.start, problem.recordings[problem.names.index(plan)]
+    if iterations < 0:
+        raise ValueError(f"`iterations` must not be negative, but is {iterations}")
     if not bounds:
         raise ValueError("`bounds` names no signal whose knots may move")
-    started = clock.perf_counter()
+    recording, started = problem.recordings[problem.names.index(plan)], clock.perf_counter()
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
     planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
     try:
-        search = Search(planner, x, rate, smoothing, seed)
+        found = search(planner, iterations, seed, progress)
     except SimulationFailed as failure:
         raise ValueError(
             f"the motion given cannot be run, so that nothing can begin with it: {failure}"
         ) from None
-    before, given = planner.deviations(x, search.seen), planner.made(search.z, x, search.seen)
-    with tqdm(total=iterations, desc="design", disable=hidden(progress)) as bar:
-        try:
-            while search.iteration < iterations:
-                search.move(iterations)
-                bar.set_postfix_str(f"criterion {search.best.value:.3f}", refresh=False)
-                bar.update(search.iteration - bar.n)
-            search.evaluate()
-            notices = []
-        except KeyboardInterrupt:
-            notices = [f"interrupted after {search.iteration} of {iterations} iterations"]
-    last = search.seen
-    peaks = [
-        f"{name} goes {part:.0%} of the way to its limits"
-        for name, part in last.peaks.items()
-        if part > 0.9
-    ]
-    notices += [
-        f"{name} goes beyond its limits, {part:.1%} of the way to them"
-        for name, part in last.peaks.items()
-        if part > 1
-    ]
-    off = {
-        name: float(np.abs(part).max())
-        for name, part in planner.linearization_error(x, last).items()
-    }
-    most = max(off, key=lambda name: off[name])
-    if off[most] > LINEARIZATION_ERROR:
-        notices.append(
-            f"a fit on steps by rtol = {rtol:g} that begins a standard deviation from the truth "
-            f"ends {off[most]:.2g} of them from it in `{most}`: take finer steps, and count "
-            "intervals that hold before this motion is used"
-        )
-    if search.failed:
-        notices.append(f"{search.failed} motions that the search tried could not be run")
     return Design(
-        given=given,
-        recording=planner.made(search.z, x, last),
-        before=before,
-        after=planner.deviations(x, last),
-        history=tuple(search.history),
-        limits=(*planner.moves.active(search.z), *peaks),
-        notices=tuple(notices),
+        recording=planner.made(found.z, found.best),
+        before=found.first.deviations,
+        after=found.best.deviations,
+        history=tuple(found.history),
+        limits=tuple(moves.active(found.z)),
+        findings=tuple(search_findings(found, iterations, rtol)),
         made_by={
             "torchsoft": version("torchsoft"),
             "criterion": criterion,
             "bounds": {name: one.model_dump() for name, one in bounds.items()},
             "limits": planner.limits,
-            "iterations": search.iteration,
-            "rate": rate,
-            "smoothing": smoothing,
+            "iterations": found.iterations,
             "rtol": rtol,
             "seed": seed,
             **planner.cost,
             "wall_s": clock.perf_counter() - started,
         },
     )
+
+
+def search_findings(found: Search, iterations: int, rtol: float) -> Iterator[Finding]:
+    """Findings on the best motion of a search, and on the search itself."""
+    if found.iterations < iterations:
+        facts = {"done": found.iterations, "iterations": iterations}
+        yield Finding("design-interrupted", "note", facts)
+    for name, part in found.best.peaks.items():
+        if part > NEAR:
+            facts = {"channel": name, "part": part}
+            yield Finding("design-limit", "warning" if part > 1 else "note", facts)
+    sds = found.best.deviations
+    off = np.abs(found.best.errors).max(0) / [*sds.values()]
+    if off.max() > LINEARIZATION_ERROR:
+        facts = {"rtol": rtol, "off": float(off.max()), "estimate": [*sds][int(off.argmax())]}
+        yield Finding("design-nonlinear", "note", facts)
+    if found.failed:
+        yield Finding("design-failed", "note", {"count": found.failed})
 
 
 # Rehearsal of an experiment: simulated recordings with the sensors' noise, whose identification
@@ -271,7 +261,6 @@ FINER = 0.1
 
 def planned(
     stated: Config,
-    file: RigFile,
     built: BuiltRig,
     name: str,
     rtol: float,
@@ -298,33 +287,32 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
     Returns the configuration of their identification, whose search begins away from the truth, and
     the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot follow.
     """
-    file, plan = RigFile.from_toml(RigFile.path(stated.rig, config.parent)), stated.rehearsal
-    entries = stated.recordings or (Entry(name="rehearsal"),)
-    paths, random = [], np.random.default_rng(plan.seed)
-    for entry in entries:
+    file = RigFile.from_toml(RigFile.path(stated.rig, config.parent))
+    rtol, random = FINER * stated.fit.rtol, np.random.default_rng(stated.rehearsal.seed)
+    own, paths = list[Entry](), list[Path]()
+    for entry in stated.recordings or (Entry(name="rehearsal"),):
         name = entry.name or Path(entry.paths[0]).stem
         with at_field("settings"):
-            mine = file.changed(stated.settings).changed(entry.settings)
-        built = mine.build()
-        known, rtol = vocabulary(built.rig, stated.columns), FINER * stated.fit.rtol
+            built = file.changed(stated.settings).changed(entry.settings).build()
         try:
-            made = planned(stated, mine, built, name, rtol, entry.start, seed=random)
+            made = planned(stated, built, name, rtol, entry.start, seed=random)
         except ValueError as error:
             raise ValueError(f"{config}: {error}") from None
-        rig = made.rig
-        followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
-        columns = {"t": made.times} | dict(zip(rig.signals, followed))
-        columns |= {channel: y for channel, (_, y) in made.samples.items()}
-        called = {of: heading for heading, of in known.headings.items()}
-        units = {called.get(one, one): known.units[one] for one in columns}
         paths.append(out / f"{name}.csv")
-        csvfile.write(paths[-1], dict(zip(units, columns.values())), units)
-    own = [
-        entry.model_copy(update={"name": path.stem, "file": None, "files": ()})
-        for entry, path in zip(entries, paths)
-    ]
-    unknowns = dict(away(stated.unknowns, file, plan.away))
+        write_template(stated, made, paths[-1])
+        own.append(entry.model_copy(update={"name": name, "file": None, "files": ()}))
+    unknowns = dict(away(stated.unknowns, file, stated.rehearsal.away))
     return stated.model_copy(update={"recordings": tuple(own), "unknowns": unknowns}), paths
+
+
+def write_template(stated: Config, made: Recording, path: Path) -> None:
+    """Write a planned recording with the headings of a configuration."""
+    rig, known = made.rig, vocabulary(made.rig, stated.columns)
+    followed = rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
+    columns = {"t": made.times} | dict(zip(rig.signals, followed))
+    columns |= {channel: y for channel, (_, y) in made.samples.items()}
+    units = {known.heading(one): known.units[one] for one in columns}
+    csvfile.write(path, dict(zip(units, columns.values())), units)
 
 
 def away(
@@ -350,24 +338,26 @@ def away(
 AS_STATED = "as stated"
 """Name of the candidate that is the motion of the rig file itself."""
 
+SAME = 1e-6
+"""Largest difference between a motion of the search and of the written file, over its largest
+value."""
 
-@dataclass(frozen=True)
-class Rated:
+
+class Rated(NamedTuple):
     """A rated candidate: the criterion, a logarithm of standard deviations, the smaller the better;
     the relative standard deviations of the parameters, and the largest fraction of their limits
     that channels reach. `failure` is the reason of a failed run."""
 
     name: str
-    value: float
-    deviations: dict[str, float]
-    peaks: dict[str, float]
+    value: float = np.inf
+    deviations: Mapping[str, float] = {}
+    peaks: Mapping[str, float] = {}
     failure: str = ""
 
     @property
     def score(self) -> float:
         """The criterion; infinite beyond a limit."""
-        beyond = self.failure or max(self.peaks.values(), default=0.0) > 1
-        return np.inf if beyond else self.value
+        return np.inf if max(self.peaks.values(), default=0.0) > 1 else self.value
 
 
 class Chosen(NamedTuple):
@@ -385,27 +375,20 @@ class Chosen(NamedTuple):
         rows = [f"{'candidate':{width}s} criterion  {'  '.join(names)}"]
         for one in self.rated:
             cells = [f"{one.deviations.get(name, np.nan):{len(name)}.2%}" for name in names]
-            content = (
-                f"cannot be made: {line(one.failure, 120)}" if one.failure else "  ".join(cells)
-            )
-            limit = [f"{k} goes beyond its limits" for k, part in one.peaks.items() if part > 1]
-            rows.append("  ".join([f"{one.name:{width}s} {one.value:9.3f}", content, *limit]))
+            if one.failure:
+                cells = [f"cannot be made: {line(one.failure, 120)}"]
+            cells += [f"{k} goes beyond its limits" for k, part in one.peaks.items() if part > 1]
+            rows.append("  ".join([f"{one.name:{width}s} {one.value:9.3f}", *cells]))
         return "\n".join(rows)
 
     def summary(self) -> dict[str, Any]:
         """Content of `design.json`."""
-        out: dict[str, Any] = {"candidates": [asdict(one) for one in self.rated]}
-        if self.found is not None:
-            one = self.found
-            out |= {
-                "before": one.before,
-                "after": one.after,
-                "limits": one.limits,
-                "history": [asdict(visit) for visit in one.history],
-                "notices": one.notices,
-                "confirmed": one.confirmed,
-                "made_by": one.made_by,
-            }
+        out: dict[str, Any] = {"candidates": [one._asdict() for one in self.rated]}
+        if (one := self.found) is not None:
+            history = [asdict(visit) for visit in one.history]
+            said = [asdict(finding) | {"text": str(finding)} for finding in one.findings]
+            own = {name: value for name, value in vars(one).items() if name != "recording"}
+            out |= own | {"history": history, "findings": said, "confirmed": one.confirmed}
         return out
 
 
@@ -429,45 +412,38 @@ def rank(
     """
     rated = list[Rated]()
     for one in candidates:
-        problem = Problem([*recorded, one], sensors, unknowns)
-        planner = Planner(
-            problem,
-            one.name,
+        problem, moves = (
+            Problem([*recorded, one], sensors, unknowns),
             Moves(one.rig.reference, {}, 0.0),
-            limits or {},
-            criterion,
-            names,
-            rtol,
-            workers,
         )
-        x = problem.coordinates.start
+        planner = Planner(problem, one.name, moves, limits or {}, criterion, names, rtol, workers)
         try:
-            seen = planner.evaluate(np.zeros(0), x)
+            seen = planner.evaluate(np.zeros(0))
         except SimulationFailed as failure:
-            rated.append(Rated(one.name, np.inf, {}, {}, str(failure)))
+            rated.append(Rated(one.name, failure=str(failure)))
         else:
-            rated.append(Rated(one.name, seen.value, planner.deviations(x, seen), seen.peaks))
+            rated.append(Rated(one.name, seen.value, seen.deviations, seen.peaks))
     return sorted(rated, key=lambda one: (one.score, one.value))
 
 
-SAME = 1e-6
-"""Largest difference between a motion of the search and of the written file, over its largest
-value."""
-
-
-def unlike(found: Recording, again: Recording) -> list[str]:
-    """Sentences on motions of a written file that are not those that the search found."""
-    t, said = torch.from_numpy(found.times), list[str]()
-    motions = [one.rig.follow(t).detach()[..., 0].mT for one in (found, again)]
-    for name, was, now in zip(found.rig.signals, *motions):
-        off, most = float((now - was).abs().max()), float(was.abs().max())
-        if not off <= SAME * most:
-            said.append(
-                f"motion.{name} of the written file is up to {off:.3g} off what the search found, "
-                f'of {most:.3g}: the file makes "start" or "held" anew with the new motion; give '
-                "numbers in their place"
-            )
-    return said
+def candidates(
+    config: Path, stated: Config
+) -> tuple[dict[str, RigFile], dict[str, Recording], list[Rated]]:
+    """Rig files of a configuration's candidates by name, their planned recordings, and those that
+    cannot be run. Raises `ValueError` for settings that do not fit the rig file."""
+    with at_field("settings"):
+        file = RigFile.from_toml(RigFile.path(stated.rig, config.parent)).changed(stated.settings)
+    files, made, failures = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
+    for name, settings in ({AS_STATED: {}} | stated.design.candidates).items():
+        with at_field(f"design.candidates.{name}"):
+            known = isinstance(settings, str)
+            files[name] = excite(file, settings) if known else file.changed(settings)
+            built = files[name].build()
+        try:
+            made[name] = planned(stated, built, name, stated.design.rtol, noise=0.0)
+        except SimulationFailed as failure:
+            failures.append(Rated(name, failure=str(failure)))
+    return files, made, failures
 
 
 def choose(
@@ -484,47 +460,33 @@ def choose(
     The rig is that of its file. Raises `ValueError` for parts that do not fit together, and where
     no candidate can be run.
     """
-    plan = stated.design
-    with at_field("settings"):
-        file = RigFile.from_toml(RigFile.path(stated.rig, config.parent)).changed(stated.settings)
-    files, made, failures = dict[str, RigFile](), dict[str, Recording](), list[Rated]()
-    for name, settings in ({AS_STATED: {}} | plan.candidates).items():
-        with at_field(f"design.candidates.{name}"):
-            known = isinstance(settings, str)
-            files[name] = excite(file, settings) if known else file.changed(settings)
-            built = files[name].build()
-        try:
-            made[name] = planned(stated, files[name], built, name, plan.rtol, noise=0.0)
-        except SimulationFailed as failure:
-            failures.append(Rated(name, np.inf, {}, {}, str(failure)))
-    common: dict[str, Any] = {
-        "limits": plan.limits,
-        "criterion": plan.criterion,
-        "names": plan.parameters or None,
-        "rtol": plan.rtol,
-        "workers": workers,
-    }
-    rated = rank(recorded, [*made.values()], stated.sensors, stated.unknowns, **common) + failures
+    plan, (files, made, failures) = stated.design, candidates(config, stated)
+    how: dict[str, Any] = plan.model_dump(include={"limits", "criterion", "rtol"})
+    how |= {"names": plan.parameters or None, "workers": workers}
+    rated = rank(recorded, [*made.values()], stated.sensors, stated.unknowns, **how) + failures
     best = rated[0].name
     if rated[0].failure:
         raise ValueError(f"{config}: no candidate can be made: {rated[0].failure}")
-    found, chosen = None, files[best]
-    if plan.bounds:
-        problem = Problem([*recorded, made[best]], stated.sensors, stated.unknowns)
-        found = design(
-            problem,
-            best,
-            plan.bounds,
-            iterations=plan.iterations,
-            seed=plan.seed,
-            progress=progress,
-            **common,
-        )
-        chosen = chosen.override(motion=knots(found.recording.rig.reference, plan.bounds))
-        try:
-            again = planned(stated, chosen, chosen.build(), best, plan.rtol, noise=0.0)
-            said = unlike(found.recording, again)
-        except (ValueError, SimulationFailed) as failure:
-            said = [f"the written file cannot be run: {failure}"]
-        found = replace(found, notices=(*found.notices, *said), confirmed=not said)
-    return Chosen(rated, chosen, found)
+    if not plan.bounds:
+        return Chosen(rated, files[best], None)
+    problem = Problem([*recorded, made[best]], stated.sensors, stated.unknowns)
+    how |= {"iterations": plan.iterations, "seed": plan.seed, "progress": progress}
+    found = design(problem, best, plan.bounds, **how)
+    moved = files[best].override(motion=knots(found.recording.rig.reference, plan.bounds))
+    more = file_findings(stated, moved, found.recording)
+    return Chosen(rated, moved, replace(found, findings=(*found.findings, *more)))
+
+
+def file_findings(stated: Config, written: RigFile, found: Recording) -> Iterator[Finding]:
+    """Findings on motions of a written file that are not those that the search found."""
+    try:
+        again = planned(stated, written.build(), found.name, stated.design.rtol, noise=0.0)
+    except (ValueError, SimulationFailed) as failure:
+        yield Finding("design-file", "warning", {"failure": str(failure)})
+        return
+    t = torch.from_numpy(found.times)
+    motions = [one.rig.follow(t).detach()[..., 0].mT for one in (found, again)]
+    for name, was, now in zip(found.rig.signals, *motions):
+        off, most = float((now - was).abs().max()), float(was.abs().max())
+        if not off <= SAME * most:
+            yield Finding("design-file", "warning", {"signal": name, "off": off, "most": most})

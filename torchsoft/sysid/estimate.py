@@ -16,8 +16,6 @@ from torchsoft.sysid.residual_tests import parts, whiteness
 from torchsoft.sysid.unknowns import FAULTS, Coordinate, Prior
 from torchsoft.tables import Number
 
-CONFIDENCE = 0.95
-
 IDENTIFIABLE = 0.5
 """Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval
 spans a factor of seven."""
@@ -60,6 +58,15 @@ class Estimate:
         """Name, with the recording to which it belongs."""
         return self.name + (f" in {self.recording}" if self.recording else "")
 
+    @property
+    def found(self) -> str:
+        """Value and interval, or where the search ended."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        if self.value is None or self.ci95 is None:
+            return f"not identifiable (the search ended at {self.last:.3g}{unit})"
+        low, high = self.ci95
+        return f"{self.value:.5g}{unit}, 95 % {low:.5g} to {high:.5g}"
+
 
 @dataclass(frozen=True)
 class Direction:
@@ -100,10 +107,6 @@ class Quantity(NamedTuple):
     places: list[int]
     prior: Prior | None
 
-    @property
-    def label(self) -> str:
-        return self.name + (f" in {self.recording}" if self.recording else "")
-
     def identifiable(self, sd: float) -> bool:
         """Whether the data determine it to a standard deviation of the logarithm, or of the value
         over `size`."""
@@ -114,7 +117,7 @@ class Quantity(NamedTuple):
 
     def interval(self, sd: float) -> tuple[float, float]:
         """95 % interval for a standard deviation of the logarithm, or of the value over `size`."""
-        reach = float(stats.norm.ppf(0.5 + CONFIDENCE / 2)) * sd
+        reach = float(stats.norm.ppf(0.975)) * sd
         if self.size is not None:
             return self.value - reach * self.size, self.value + reach * self.size
         reach = min(reach, 700.0)  # a parameter without any trace in the data would overflow
@@ -123,39 +126,46 @@ class Quantity(NamedTuple):
 
 def quantities(fit: Fit) -> Iterator[Quantity]:
     """Fitted parameters in physical units, then coordinates of starts and faults of sensors."""
-    problem, x, free, c = fit.problem, fit.x, fit.free, fit.problem.coordinates
-    for k, recording in enumerate(problem.recordings):
-        values, before = problem.values(x, k), problem.values(c.start, k)
-        chain = c.jacobian(x, recording.name, values)
-        for row, name in enumerate(c.names):
-            places = [int(i) for i in np.flatnonzero(chain[row]) if free[i]]
-            own = any(c.all[i].recording is not None for i in places)
-            if name.startswith(PREFIX) or not places or (k > 0 and not own):
-                continue
-            first, value = c.all[places[0]], values[name]
-            alone, size = len(places) == 1 and first.name == name and not first.ratio_to, None
-            if first.scale == "linear":
-                size = first.high - first.low if alone else abs(value)
-            declared = recording.rig.quantity(name)
-            yield Quantity(
-                name,
-                "parameter",
-                recording.name if own else None,
-                declared.unit if declared else "",
-                value,
-                first.nominal if alone else before[name],
-                size,
-                chain[row] / (value if size is None else size),
-                places,
-                first.prior if alone else None,
-            )
+    x, c = fit.x, fit.problem.coordinates
+    for k, recording in enumerate(fit.problem.recordings):
+        for one in parameter_quantities(fit, k):
+            if k == 0 or one.recording == recording.name:
+                yield one
     for i, one in enumerate(c.all):
-        if one.kind != "parameter" and free[i]:
-            name, unit = replace(one, recording=None).label, nuisance_unit(one, problem)
+        if one.kind != "parameter" and fit.free[i]:
+            name, unit = replace(one, recording=None).label, nuisance_unit(one, fit.problem)
             slope, size, value = np.eye(len(c))[i], float(one.slope(x[i])), one.to_value(x[i])
             yield Quantity(
                 name, one.kind, one.recording, unit, value, one.nominal, size, slope, [i], one.prior
             )
+
+
+def parameter_quantities(fit: Fit, k: int) -> Iterator[Quantity]:
+    """Fitted parameters of recording k."""
+    problem, c, recording = fit.problem, fit.problem.coordinates, fit.problem.recordings[k]
+    values, before = problem.values(fit.x, k), problem.values(c.start, k)
+    for name, row in zip(c.names, c.jacobian(fit.x, recording.name, values)):
+        places = [int(i) for i in np.flatnonzero(row) if fit.free[i]]
+        if name.startswith(PREFIX) or not places:
+            continue
+        first, value = c.all[places[0]], values[name]
+        alone, size = len(places) == 1 and first.name == name and not first.ratio_to, None
+        if first.scale == "linear":
+            size = first.high - first.low if alone else abs(value)
+        declared = recording.rig.quantity(name)
+        own = any(c.all[i].recording is not None for i in places)
+        yield Quantity(
+            name,
+            "parameter",
+            recording.name if own else None,
+            declared.unit if declared else "",
+            value,
+            first.nominal if alone else before[name],
+            size,
+            row / (value if size is None else size),
+            places,
+            first.prior if alone else None,
+        )
 
 
 def estimates(fit: Fit, C: Array, shift: Array) -> list[Estimate]:
@@ -165,19 +175,17 @@ def estimates(fit: Fit, C: Array, shift: Array) -> list[Estimate]:
     for one in quantities(fit):
         sd = float(np.sqrt(max(one.slope @ C @ one.slope, 0.0)))
         identifiable = one.identifiable(sd)
-        known = (one.value, one.interval(sd)) if identifiable else (None, None)
-        relative = sd if one.size is None else sd * one.size / max(abs(one.value), 1e-300)
-        bias = float(one.slope @ shift) / sd if sd > 0 else 0.0
         found = Estimate(
             one.name,
             one.unit,
             one.recording,
-            *known,
-            relative,
+            one.value if identifiable else None,
+            one.interval(sd) if identifiable else None,
+            sd if one.size is None else sd * one.size / max(abs(one.value), 1e-300),
             one.value,
             identifiable,
             bool(edge[one.places].any()),
-            bias,
+            float(one.slope @ shift) / sd if sd > 0 else 0.0,
             one.kind,
             one.start,
             one.prior,
@@ -219,10 +227,10 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
 
 def residual_channels(fit: Fit) -> list[ChannelResiduals]:
     """Residuals of every channel of the fitted recordings."""
-    orders, out = {channel: one.order for channel, one in fit.problem.noise.items()}, []
+    out = []
     for part in parts(fit.problem, fit.at.r, fit.which):
-        r = fit.at.r[part.rows]
+        r, order = fit.at.r[part.rows], 0 if part.noise is None else part.noise.order
         rms, stated = (float(np.sqrt(np.mean(rows**2))) for rows in (r, part.raw))
-        white = whiteness(r, orders.get(part.channel, 0))
+        white = whiteness(r, order)
         out.append(ChannelResiduals(part.recording, part.channel, rms, *white, stated))
     return out

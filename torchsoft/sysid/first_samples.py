@@ -75,37 +75,31 @@ def estimate_initial_state(
     """
     rig, first, owner = recording.rig, float(recording.times[0]), f"recording `{recording.name}`"
     sensors = {rig.full(name): sensor for name, sensor in sensors.items()}
-    late = {channel: t >= first + lead - SAME for channel, (t, _) in recording.samples.items()}
-    if strange := [name for name in given or {} if name not in free_coordinates(rig)]:
-        raise ValueError(
-            f"`given` speaks of `{strange[0]}`; "
-            f"{suggestion(strange[0], free_coordinates(rig), 'there are')}"
-        )
-    if slow := [channel for channel, sensor in sensors.items() if sensor.delay > lead]:
-        raise ValueError(
-            f"`{slow[0]}` may come late by {sensors[slow[0]].delay:g} s, but runs are known only "
-            f"from {lead:g} s before the samples that count; take a longer `lead`"
-        )
-    if empty := [channel for channel, kept in late.items() if kept.sum() < 2]:
-        raise ValueError(
-            f"{owner} has no two samples of `{empty[0]}` left after `lead` = {lead:g} s"
-        )
-    early = {
-        c: (t[~late[c]] - first, y[~late[c]])
-        for c, (t, y) in recording.samples.items()
-        if c in sensors
-    }
-    samples = {c: (t[late[c]], y[late[c]]) for c, (t, y) in recording.samples.items()}
-    lead = min(float(t[0]) for t, _ in samples.values()) - first
+    every, early, late = recording.samples, {}, {}
+    for name in given or {}:
+        if name not in (known := free_coordinates(rig)):
+            raise ValueError(f"`given` speaks of `{name}`; {suggestion(name, known, 'there are')}")
+    for channel, (t, y) in every.items():
+        kept = t >= first + lead - SAME
+        late[channel] = t[kept], y[kept]
+        if kept.sum() < 2:
+            raise ValueError(
+                f"{owner} has no two samples of `{channel}` left after `lead` = {lead:g} s"
+            )
+        if channel in sensors:
+            early[channel] = t[~kept] - first, y[~kept]
+            if (delay := sensors[channel].delay) > lead:
+                raise ValueError(
+                    f"`{channel}` may come late by {delay:g} s, but runs are known only from "
+                    f"{lead:g} s before the samples that count; take a longer `lead`"
+                )
+    lead = min(float(t[0]) for t, _ in late.values()) - first
     efforts = [abs(y).max() for c, (_, y) in early.items() if recording.units[c] == "N"]
     weight = sum(one.mass.item() for one in rig.bodies.values()) * rig.gravity.item()
     load = float(max(efforts, default=weight))
     bodies = completed(rig, measured(rig, early, sensors, owner) | dict(given or {}), first, load)
-    return replace(
-        recording,
-        samples=samples,
-        start=MovingStart(bodies, stretches(rig, bodies, first, lead), lead),
-    )
+    start = MovingStart(bodies, stretches(rig, bodies, first, lead), lead)
+    return replace(recording, samples=late, start=start)
 
 
 def measured(
@@ -113,9 +107,8 @@ def measured(
 ) -> dict[str, Normal]:
     """Coordinates and rates at time zero from the `early` samples, each by the most accurate
     channel."""
-    names, channels, found = free_coordinates(rig), measurable(rig), dict[str, Normal]()
-    count = len(names) // 2
-    for k, (name, channel) in enumerate(zip(names, channels)):
+    names, found = free_coordinates(rig), dict[str, Normal]()
+    for k, (name, channel) in enumerate(zip(names, measurable(rig))):
         if channel not in early:
             continue
         other = 0.0
@@ -123,10 +116,11 @@ def measured(
             beside, _ = partner(rig, channel)
             other = float(np.abs(early[beside][1]).max()) if beside in early else np.inf
         fits = first_value(f"`{channel}` of {owner}", *early[channel], sensors[channel], other)
-        for end, fit in zip((name, names[k + count]) if k < count else (name,), fits):
-            if end not in found or fit[1] < found[end][1]:
-                found[end] = fit
-    return {name: fit for name, fit in found.items() if np.isfinite(fit[1])}
+        mine = (name, *names[k + len(names) // 2 :][:1])  # a coordinate and its rate, or a rate
+        for end, (mean, sd) in zip(mine, fits):
+            if sd < found.get(end, (0.0, np.inf))[1]:
+                found[end] = mean, sd
+    return found
 
 
 def first_value(
@@ -148,10 +142,9 @@ def first_value(
     noise = max(sensor.sd, float(np.sqrt(np.sum((V @ fit - y) ** 2) / (len(t) - degree - 1))))
     sd = WIDER * noise * np.sqrt(np.diag(np.linalg.inv(V.T @ V)))
     value, rate, bend = fit[0], fit[1] / span, 2 * fit[2] / span**2
-    wrong = sensor.bias + sensor.gain * abs(value) + sensor.delay * abs(rate)
-    wrong += sensor.misalignment * other if sensor.misalignment > 0 else 0.0
-    wrong_rate = sensor.drift + sensor.gain * abs(rate) + sensor.delay * abs(bend)
-    wrong_rate += sensor.misalignment * other / span if sensor.misalignment > 0 else 0.0
+    turned = sensor.misalignment * other if sensor.misalignment > 0 else 0.0
+    wrong = sensor.bias + sensor.gain * abs(value) + sensor.delay * abs(rate) + turned
+    wrong_rate = sensor.drift + sensor.gain * abs(rate) + sensor.delay * abs(bend) + turned / span
     return (float(value), float(np.hypot(sd[0], wrong))), (
         float(rate),
         float(np.hypot(sd[1] / span, wrong_rate)),
@@ -238,34 +231,27 @@ def rolling(
         return {}
     bodies = dict(known) | dict.fromkeys(missing, (0.0, 0.0))
     state = unstretched(rig, *placed(rig, signals, bodies, {}))
-    forces = loads(rig, state)
+    forces, none = loads(rig, state), torch.zeros(len(missing), dtype=torch.float64)
 
-    def glide(rates: Array) -> Array:
+    def glide(rates: Tensor) -> Tensor:
         """Weighted velocities of the bodies' points relative to the pads', linear in the missing
         rates."""
-        values = {
-            PREFIX + name: torch.tensor(rate, dtype=torch.float64)
-            for name, rate in zip(missing, rates)
-        }
-        moving, rows = (
-            state._replace(velocity=placed(rig, signals, bodies, values)[1]),
-            [torch.zeros(1, 2).double()],
-        )
+        values = {PREFIX + name: rate for name, rate in zip(missing, rates)}
+        moving = state._replace(velocity=placed(rig, signals, bodies, values)[1])
+        rows = [rates.new_zeros(1, 2)]
         for name, F_N in forces.items():
             pad = rig.contacts[name].pad
             u = rig.pads[pad].at_points(rig.displacement(pad, state))
             x = rig.point_inputs(name, moving, u, torch.zeros_like(u))
             v = x[:, 7:9] + x[:, 9:10] * cross(point_place(x)[0]) - x[:, 5:7]
             rows.append(F_N.sqrt()[:, None] * v)
-        return torch.cat(rows).detach().numpy().ravel()
+        return torch.cat(rows).ravel()
 
-    none = glide(np.zeros(len(missing)))
-    J = np.stack([glide(row) - none for row in np.eye(len(missing))], -1)
-    rates = np.linalg.lstsq(J, -none, rcond=None)[0]
-    ends = [name.split(".v_") for name in missing]
+    J: Tensor = torch.autograd.functional.jacobian(glide, none)  # pyright: ignore[reportAssignmentType]
+    rates = np.linalg.lstsq(J.numpy(), -glide(none).detach().numpy(), rcond=None)[0]
     return {
-        name: (float(rate), SPEED / reach(rig, *end))
-        for name, rate, end in zip(missing, rates, ends)
+        name: (float(rate), SPEED / reach(rig, *name.split(".v_")))
+        for name, rate in zip(missing, rates)
     }
 
 

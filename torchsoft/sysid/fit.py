@@ -5,7 +5,7 @@ import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -480,6 +480,41 @@ def no_headway(chi2: Sequence[float]) -> bool:
     )
 
 
+class Trials:
+    """Residuals of a fit at displacements z of its fitted coordinates, with new Jacobians; the best
+    and the latest are kept. Raises `Stalled` where a fit with the linear loss makes no headway far
+    above the noise."""
+
+    def __init__(self, fit: Fit, known: bool) -> None:
+        """`known` says that the fit has its residuals and Jacobian."""
+        self.fit, self.chi2 = fit, list[float]()
+        self.seen = dict[bytes, Residuals]()
+        if known:
+            self._keep(np.zeros(int(fit.free.sum())), fit.at)
+
+    def __call__(self, z: Array) -> Residuals:
+        if z.tobytes() not in self.seen:
+            self._keep(z, self.fit.residuals(self.moved(z), jacobian=True))
+            self.fit.notify(self.chi2[-1])
+            if self.fit.loss == "linear" and no_headway(self.chi2):
+                raise Stalled
+        return self.seen[z.tobytes()]
+
+    def _keep(self, z: Array, at: Residuals) -> None:
+        self.seen = {key: self.seen[key] for key in [self.best] if self.seen}
+        self.seen[z.tobytes()] = at
+        self.chi2.append(float(np.mean(at.r**2)))
+
+    @property
+    def best(self) -> bytes:
+        """Key of the trial that leaves least."""
+        return min(self.seen, key=lambda k: float(self.seen[k].r @ self.seen[k].r), default=b"")
+
+    def moved(self, z: Array) -> Array:
+        """Coordinates x (n,) of the problem at a displacement."""
+        return self.fit.place(self.fit.x[self.fit.free] + z)
+
+
 def gauss_newton(
     fit: Fit, evaluations: int = 30, tolerance: float = 1e-6, anew: bool = False
 ) -> Fit:
@@ -492,35 +527,15 @@ def gauss_newton(
     """
     (low, high), free = fit.problem.coordinates.bounds, fit.free
     fit, start = fit._replace(x=fit.within_bounds(fit.x)), fit.x
-    zero = np.zeros(int(free.sum()))
-    known = len(fit.at.r) and not anew and (fit.x == start).all()
-    seen = {zero.tobytes(): fit.at} if known else {}  # the best and the latest
-    chi2 = [float(np.mean(one.r**2)) for one in seen.values()]
-
-    def moved(z: Array) -> Array:
-        return fit.place(fit.x[free] + z)
-
-    def at(z: Array) -> Residuals:
-        key = z.tobytes()
-        if key not in seen:
-            best = min(seen, key=lambda k: float(seen[k].r @ seen[k].r), default=key)
-            for old in seen.keys() - {best}:
-                del seen[old]
-            seen[key] = fit.residuals(moved(z), jacobian=True)
-            chi2.append(float(np.mean(seen[key].r ** 2)))
-            fit.notify(chi2[-1])
-            if fit.loss == "linear" and no_headway(chi2):
-                raise Stalled
-        return seen[key]
-
-    if failed := at(zero).failed:
+    zero, solve = np.zeros(int(free.sum())), cast(Any, least_squares)
+    trials = Trials(fit, bool(len(fit.at.r) and not anew and (fit.x == start).all()))
+    if failed := trials(zero).failed:
         raise Unreachable(failed)
-    solve: Any = least_squares
     try:
         out = solve(
-            lambda z: at(z).r,
+            lambda z: trials(z).r,
             zero,
-            jac=lambda z: at(z).J[:, free],
+            jac=lambda z: trials(z).J[:, free],
             bounds=(low[free] - fit.x[free], high[free] - fit.x[free]),
             loss=robust_loss_except_priors(fit.loss, len(fit.problem.coordinates.priors)),
             f_scale=REACH[fit.loss],
@@ -531,11 +546,9 @@ def gauss_newton(
         )
         z, count, converged, stalled = out.x, int(out.nfev), out.status > 0, False
     except Stalled:
-        key = min(seen, key=lambda k: float(seen[k].r @ seen[k].r))
-        z, count, converged, stalled = np.frombuffer(key), len(chi2), False, True
-    return fit._replace(
-        x=moved(z), at=at(z), evaluations=count, converged=converged, stalled=stalled
-    )
+        z, count, converged, stalled = np.frombuffer(trials.best), len(trials.chi2), False, True
+    end = fit._replace(x=trials.moved(z), at=trials(z))
+    return end._replace(evaluations=count, converged=converged, stalled=stalled)
 
 
 def chord(fit: Fit, rounds: int = 5) -> Fit:

@@ -32,7 +32,6 @@ from torchsoft.sysid.fit import FAR_OFF, Fit, Loss, Stage, Unreachable, fisher
 from torchsoft.sysid.plan import FINER, default_plan, refine_steps, run_plan, shown
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.refits import coarsened
 from torchsoft.sysid.result import (
     ChannelNoise,
     IdentificationResult,
@@ -40,8 +39,9 @@ from torchsoft.sysid.result import (
     seen_together,
 )
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.search import coarsened
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
-from torchsoft.sysid.sentences import SEVERITIES
+from torchsoft.sysid.sentences import SEVERITIES, Finding
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
@@ -126,24 +126,27 @@ def identify(
     looks = accepted(precheck(problem, runner, fitted), acknowledged)
     for finding in looks if progress else ():
         tqdm.write(plain(f"{finding.severity}: {finding}"), file=sys.stderr)
-    try:
-        if plan is None:
-            plan = default_plan(problem, runner, rtol, fitted, starts)
-        start = Fit(problem, runner, problem.coordinates.start, loss=loss, progress=progress)
-        planned = run_plan(start, plan, seed=seed)
-    except Unreachable as error:  # what looks wrong with the recordings may be the cause
-        raise Unreachable(error.failed, looks) from None
+    start = Fit(problem, runner, problem.coordinates.start, loss=loss, progress=progress)
+    planned = fit_plan(start, plan, settings, fitted, looks)
     far_off = is_far_off(planned)
     end = refined(planned, 0 if far_off or loss != "linear" else tightenings)
     residuals = check_residuals(end)
     checked = check_suspects(end, residuals, settings)
 
     made_by: dict[str, Any] = settings.model_dump()
-    made_by |= {"rtol": end.rtol, "rtol_asked": plan[-1].rtol, "acknowledged": [*acknowledged]}
+    made_by |= {"rtol": end.rtol, "rtol_asked": asked(plan, settings)}
+    made_by |= {"acknowledged": [*acknowledged]}
     answer = concluded(end, residuals, checked, heldout, made_by, far_off)
+    return completed(answer, looks, clock.perf_counter() - started)
+
+
+def completed(
+    answer: IdentificationResult, looks: Sequence[Finding], wall_s: float
+) -> IdentificationResult:
+    """The answer with what was found before the fit, the gravest findings first, and the time that
+    it took [s]."""
     findings = sorted([*looks, *answer.findings], key=lambda one: SEVERITIES.index(one.severity))
-    cost = answer.cost | {"wall_s": clock.perf_counter() - started}
-    return replace(answer, findings=findings, cost=cost)
+    return replace(answer, findings=findings, cost=answer.cost | {"wall_s": wall_s})
 
 
 def explain(problem: Problem, **options: Any) -> IdentificationResult:
@@ -172,6 +175,29 @@ def check_arguments(
             "`starts` and `rtol` are those of the default plan: set them in the stages of `plan` "
             "instead"
         )
+
+
+def fit_plan(
+    start: Fit,
+    plan: Sequence[Stage] | None,
+    settings: Settings,
+    fitted: Sequence[str],
+    looks: Sequence[Finding],
+) -> Fit:
+    """The fit of a plan, by default of `default_plan`. Raises `Unreachable` with what looks wrong
+    with the recordings, since that may be its cause."""
+    try:
+        if plan is None:
+            rtol, starts = settings.rtol, settings.starts
+            plan = default_plan(start.problem, start.runner, rtol, fitted, starts)
+        return run_plan(start, plan, seed=settings.seed)
+    except Unreachable as error:
+        raise Unreachable(error.failed, looks) from None
+
+
+def asked(plan: Sequence[Stage] | None, settings: Settings) -> float:
+    """Tolerance of the last stage of a plan."""
+    return settings.rtol if plan is None else plan[-1].rtol
 
 
 def is_far_off(planned: Fit) -> bool:
@@ -240,21 +266,29 @@ def concluded(
         made_by=made_by | provenance(problem),
         covariance=C.tolist(),
         recordings=recorded_rigs(end),
-        unknowns=dict(problem.unknowns),
-        sensors=dict(problem.sensors),
-        coordinates=[
+        combinations=seen_together(end, C),
+        assumptions=checked.checks,
+        **described(end),
+    )
+
+
+def described(end: Fit) -> dict[str, Any]:
+    """The problem of a fit, as fields of its answer."""
+    problem = end.problem
+    return {
+        "unknowns": dict(problem.unknowns),
+        "sensors": dict(problem.sensors),
+        "coordinates": [
             replace(one, fixed=not is_free)
             for one, is_free in zip(problem.coordinates.all, end.free)
         ],
-        combinations=seen_together(end, C),
-        noise=[
+        "noise": [
             ChannelNoise(name, model, [*end.colour[name].scores] if name in end.colour else [])
             for name, model in problem.noise.items()
         ],
-        assumptions=checked.checks,
-        versions={"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
-        rigs={recording.name: recording.rig for recording in problem.recordings},
-    )
+        "versions": {"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
+        "rigs": {recording.name: recording.rig for recording in problem.recordings},
+    }
 
 
 def work(end: Fit) -> dict[str, float]:

@@ -5,10 +5,12 @@ field.
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from torchsoft.cost import RUN, Cost, rig_row, rig_step, steps_per_second
 from torchsoft.csvfile import UNITS
+from torchsoft.display import suggestion
 from torchsoft.physics.channels import Seen, Touch, measurable, read, units
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
@@ -23,7 +26,7 @@ from torchsoft.physics.state import State
 from torchsoft.physics.statics import net_loads
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
-from torchsoft.sysid.columns import Tables, Vocabulary, read_tables
+from torchsoft.sysid.columns import Columns, Tables, Vocabulary, read_tables
 from torchsoft.sysid.configuration import (
     Column,
     Config,
@@ -38,11 +41,10 @@ from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing
 from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.prechecks import channel as channel_of
-from torchsoft.sysid.prechecks import confusions
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Sensor, by_channel
-from torchsoft.tables import line
+from torchsoft.tables import line, shown
 
 # Recordings of the rig that a rig file describes.
 #
@@ -82,10 +84,25 @@ def vocabulary(rig: Rig, stated: Mapping[str, Column]) -> Vocabulary:
     known |= {name: touch.unit(name) for name in touch}
     names = (*signals, *(f"{name}_dot" for name in signals), *measurable(rig), *touch)
     columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
-    headings = {heading: one.of for heading, one in stated.items() if one.of is not None}
-    unwrapped = [heading for heading, one in stated.items() if one.unwrap]
-    short = {name: full for name, full in rig.short.items() if full in columns}
-    return Vocabulary(columns, signals, short=short).renamed(headings, unwrapped)
+    usual = {short: full for short, full in rig.short.items() if full in columns}
+    usual |= {name: name for name in columns}
+    headings, unwrapped = dict[str, str](), list[str]()
+    for heading, one in stated.items():
+        name = usual.get(one.of or heading, one.of or heading)
+        if name not in columns:
+            raise ValueError(
+                f"columns.{heading} = {shown(name)} is no channel of the rig; "
+                f"{suggestion(name, columns, 'there are')}"
+            )
+        if one.unwrap and columns[name] != "rad":
+            raise ValueError(
+                f"columns.{heading}.unwrap: `{name}` is in {columns[name]}, and only angles "
+                "wrap: leave it out"
+            )
+        headings |= {heading: name} if one.of else {}
+        unwrapped += [name] if one.unwrap else []
+    usual = {heading: name for heading, name in usual.items() if name not in headings.values()}
+    return Vocabulary(columns, signals, usual | headings, tuple(unwrapped))
 
 
 def followed(tables: Tables, rig: Rig) -> Reference:
@@ -192,13 +209,85 @@ def check_clock(file: RigFile, rig: Rig, tables: Tables, start: StartTable) -> N
             )
 
 
+class FirstRows(NamedTuple):
+    """A column of lengths, angles or their rates: its name and unit, its table with the rows that
+    have samples, times t (k,) [s] and values y (k,) there, and the noise and bias of its sensor."""
+
+    name: str
+    unit: str
+    table: Columns
+    rows: Array
+    t: Array
+    y: Array
+    noise: float
+    bias: float
+
+    def at(self, i: int) -> str:
+        return f"{self.table.at(self.rows[i])}, column `{self.name}`"
+
+
 def check_start(
     made: Recording, y0: Tensor, own: Reference, tables: Tables, sensors: Mapping[str, Sensor]
 ) -> None:
     """Raises `ValueError` naming row and column for a recording that does not begin at rest, with
     coordinates and set-points where the rig file says; `own` are the file's motions."""
-    rig, start, first = made.rig, made.start, tables.first_time
-    assert isinstance(start, Standing)
+    first, columns = tables.first_time, list[FirstRows]()
+    for name, (t, y) in tables.columns.items():
+        unit, rows = tables.known.units[name], np.flatnonzero(np.isfinite(y))
+        late = name in made.samples and made.samples[name][0][0] > first + EARLY
+        if len(rows) and not late and unit.startswith(("m", "rad")):
+            sensor = sensors.get(name)
+            noise, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
+            table = tables.of(name)
+            columns.append(FirstRows(name, unit, table, rows, t[rows], y[rows], noise, bias))
+    check_places(made, y0, own, first, columns)
+    check_rest(made, y0, own, first, columns)
+
+
+def check_places(
+    made: Recording, y0: Tensor, own: Reference, first: float, columns: Sequence[FirstRows]
+) -> None:
+    """Raises `ValueError` for a column that begins elsewhere than the rig file."""
+    places, unsure = start_places(made, y0, own, first)
+    for one in columns:
+        known, y, unit = places.get(one.name, [one.y[0]]), one.y[0], one.unit
+        near = (ASIDE if one.name in made.rig.signals else APART).get(unit, np.inf)
+        near += one.noise + one.bias + unsure.get(one.name, 0.0)
+        if min(abs(y - place) for place in known) > near:
+            raise ValueError(
+                f"{one.at(0)}: it begins at {y:.5g} {unit}, but the rig file at {known[0]:.5g} "
+                f"{unit}: are its unit, sign and zero right? If so, state it there, {WAY_OUT}"
+            )
+
+
+def check_rest(
+    made: Recording, y0: Tensor, own: Reference, first: float, columns: Sequence[FirstRows]
+) -> None:
+    """Raises `ValueError` for a column that moves from the first sample on."""
+    rig = made.rig
+    speed, rush = pace(made, rig.unpack(y0, rig.follow(first).detach()), own, first)
+    smallest = min(body.shape.size() for body in rig.bodies.values() if body.shape is not None)
+    for one in columns:
+        fastest = speed + rush * (one.t - first + made.start.lead)
+        fastest /= smallest if "rad" in one.unit else 1.0
+        size, most = np.abs(one.y - one.y[0]), fastest * (one.t - one.t[0]) + one.noise
+        if one.unit.endswith("/s"):
+            size, most = np.abs(one.y), fastest + one.noise + one.bias
+        early = (one.t <= first + EARLY) | (np.arange(len(one.t)) < 2)
+        for i in np.flatnonzero(early & (size > most))[:1]:
+            raise ValueError(
+                f"{one.at(i)} moves already, by {size[i]:.3g} {one.unit}: is its unit right? If it "
+                "is, a recording must begin at rest, its bodies where the rig file has them start, "
+                f"{WAY_OUT}"
+            )
+
+
+def start_places(
+    made: Recording, y0: Tensor, own: Reference, first: float
+) -> tuple[dict[str, list[float]], dict[str, float]]:
+    """Values of coordinates and set-points at the start by the rig file, by column, and by how much
+    they may differ; a set-point may also be where its coordinate is."""
+    rig = made.rig
     with torch.no_grad():
         signals = rig.follow(first)
         here = read(Seen(rig, rig.unpack(y0, signals), signals))
@@ -212,44 +301,7 @@ def check_start(
         channel_of(rig, one.name.removeprefix(PREFIX)): BOUNDS * one.sd
         for one in made.start_coordinates
     }
-    unsure |= dict.fromkeys(rig.signals, max(unsure.values(), default=0.0))
-    speed, rush = pace(made, rig.unpack(y0, signals), own, first)
-    smallest = min(body.shape.size() for body in rig.bodies.values() if body.shape is not None)
-    for name, (t, column) in tables.columns.items():
-        unit, rows = tables.known.units[name], np.flatnonzero(np.isfinite(column))
-        late = name in made.samples and made.samples[name][0][0] > first + EARLY
-        if not len(rows) or late or not unit.startswith(("m", "rad")):
-            continue
-        t, y, table, sensor = t[rows], column[rows], tables.of(name), sensors.get(name)
-        noise, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
-        near = (ASIDE if name in rig.signals else APART).get(unit, np.inf)
-        near += noise + bias + unsure.get(name, 0.0)
-        place = places.get(name, [0.0])[0]
-        others = {one: k for k, one in confusions(unit) if abs(y[0] / k - place) <= near}
-        if name in places and min(abs(y[0] - one) for one in places[name]) > near:
-            opposite = abs(y[0] + place) <= near
-            raise ValueError(
-                f"{table.at(int(rows[0]))}, column `{name}`: it begins at {y[0]:.5g} {unit}, but "
-                f"the rig file at {place:.5g} {unit}; {question([*others])}"
-                + ("is its sign opposite?" if opposite else f"say so there, {WAY_OUT}")
-            )
-        early = (t <= first + EARLY) | (np.arange(len(t)) < 2)
-        fastest = (speed + rush * (t - first + start.lead)) / (smallest if "rad" in unit else 1.0)
-        size, most = np.abs(y - y[0]), fastest * (t - t[0]) + noise
-        if unit.endswith("/s"):
-            size, most = np.abs(y), fastest + noise + bias
-        for i in np.flatnonzero(early & (size > most))[:1].tolist():
-            slow = [one for one, k in others.items() if not (size / k > most)[early].any()]
-            raise ValueError(
-                f"{table.at(int(rows[i]))}, column `{name}` moves already, by {size[i]:.3g} "
-                f"{unit}: {question(slow)}a recording must begin at rest, its bodies where the rig "
-                f"file has them start, {WAY_OUT}"
-            )
-
-
-def question(units: Sequence[str]) -> str:
-    """The question whether a column is in another unit, empty where there is none."""
-    return f"is its unit right ({' or '.join(units)})? If it is, " if units else ""
+    return places, unsure | dict.fromkeys(rig.signals, max(unsure.values(), default=0.0))
 
 
 def pace(made: Recording, state: State, own: Reference, first: float) -> tuple[float, float]:
@@ -287,44 +339,36 @@ CHECKED = 30
 
 
 def cost(
-    problem: Problem,
-    rtol: float,
-    starts: int,
-    workers: int,
-    heldout: tuple[str, ...] = (),
+    problem: Problem, rtol: float, starts: int, workers: int, heldout: tuple[str, ...] = ()
 ) -> Cost:
     """Cost of `default_plan` where every stage takes all its evaluations, and of the checks before
     and after it."""
     fitted = [r for r in problem.recordings if r.name not in heldout]
-    slowest = min(fitted, key=lambda r: r.speed)
-    rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
+    slowest, coordinates = min(fitted, key=lambda r: r.speed), problem.coordinates.all
     loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
-
-    steps, seconds = 0.0, list[float]()
-    for recording in fitted:
-        first = starts * FIRST if recording is slowest else 0
-        stages = [(first + ALL, loose), (FREE, usual), (LAST if rtol < usual else 0, rtol)]
-        runs = [(number, by, True) for number, by in stages]
-        runs += [(1, loose, False), (1, FINER * rtol, False), (CHECKED, usual, False)]
-        mine = [
-            c
-            for c in problem.coordinates.all
-            if c.of_the_rig and c.recording in (None, recording.name)
-        ]
-        span = recording.duration + recording.start.lead
-        seconds.append(0.0)
-        for number, by, differentiated in runs:
-            length = span * steps_per_second(by) + rows[recording.name]
-            step = rig_step(recording.rig, max(len(mine), 1) if differentiated else 0)
-            steps += number * length
-            seconds[-1] += number * (length * step + RUN)
-    memory = sorted(rows[r.name] * rig_row(r.rig) for r in problem.recordings)
+    steps, seconds, memory = 0.0, list[float](), list[float]()
+    for one in fitted:
+        rows = len(one.grid(problem.interpolated).t)
+        own = [c for c in coordinates if c.of_the_rig and c.recording in (None, one.name)]
+        plain, derived = (rig_step(one.rig, count) for count in (0, max(len(own), 1)))
+        first = starts * FIRST if one is slowest else 0
+        took = 0.0
+        for count, by, step in (
+            (first + ALL, loose, derived),
+            (FREE, usual, derived),
+            (LAST if rtol < usual else 0, rtol, derived),
+            (1, loose, plain),
+            (1, FINER * rtol, plain),
+            (CHECKED, usual, plain),
+        ):
+            length = (one.duration + one.start.lead) * steps_per_second(by) + rows
+            steps += count * length
+            took += count * (length * step + RUN)
+        seconds.append(took)
+        memory.append(rows * rig_row(one.rig))
     at_once = max(1, min(workers, len(fitted)))
-    return Cost(
-        steps=steps,
-        seconds=max(sum(seconds) / at_once, max(seconds)),
-        memory=sum(memory[-at_once:]),
-    )
+    longest = max(sum(seconds) / at_once, max(seconds))
+    return Cost(steps=steps, seconds=longest, memory=sum(sorted(memory)[-at_once:]))
 
 
 def one_by_one(costs: Iterable[Cost]) -> Cost:
@@ -393,6 +437,17 @@ def sources(
     return {name: (own.get(name, Entry(name=name)), paths) for name, paths in files}
 
 
+@contextmanager
+def stated_in(place: str) -> Iterator[None]:
+    """Raises errors of values and files as `ValueError` that names the place that states them."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from None
+    except OSError as error:
+        raise ValueError(f"{place}: {line(error.filename)}: {error.strerror}") from None
+
+
 def load(data: Sequence[str | Path], config: str | Path, stated: Config | None = None) -> Case:
     """The problem that data files and a configuration state; `stated` is what the file says, where
     that is known already. Raises `ValueError`, and `OSError` for
@@ -400,18 +455,11 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     config = Path(config)
     stated = read_config(config) if stated is None else stated
     entries, tables = sources(data, config, stated), dict[str, Tables]()
-    try:
+    with stated_in(f"{config}, rig"):
         file = RigFile.from_toml(RigFile.path(stated.rig, config.parent))
-        rig = file.assemble()
-        columns = vocabulary(rig, stated.columns)
-    except ValueError as error:
-        raise ValueError(f"{config}, rig: {error}") from None
-    except OSError as error:
-        raise ValueError(f"{config}, rig: {stated.rig}: {error.strerror}") from None
-    try:
+        columns = vocabulary(file.assemble(), stated.columns)
+    with stated_in(str(config)):
         stated.check_unknowns(file.full)
-    except ValueError as error:
-        raise ValueError(f"{config}: {error}") from None
     for name, (entry, paths) in entries.items():
         try:
             tables[name] = read_tables(paths, stated.ignore, columns)
@@ -426,37 +474,48 @@ def load(data: Sequence[str | Path], config: str | Path, stated: Config | None =
     left_out = {name for one in tables.values() for table in one.tables for name in table.ignored}
     if strange := [name for name in stated.ignore if name not in left_out]:
         raise ValueError(f"{config}, ignore: no file has a column `{line(strange[0], 80)}`")
-
-    def problem(law: Law, field: str) -> Problem:
-        made = []
-        for name, (entry, _) in entries.items():
-            settings = (stated.settings, entry.settings, law.settings)
-            try:
-                with at_field("settings"):
-                    mine = reduce(RigFile.changed, settings, file)
-                start = entry.start or stated.start
-                made.append(rig_recording(mine, tables[name], name, stated.sensors, start))
-            except ValueError as error:
-                known = any(str(table.path) in str(error) for table in tables[name].tables)
-                raise (
-                    error if known else ValueError(f"{config}{field}, recording `{name}`: {error}")
-                ) from None
-        every = [(rig.full(k), one) for k, one in (*stated.unknowns.items(), *law.unknowns.items())]
-        without = {rig.full(name) for name in law.without}
-        unknowns = {name: one for name, one in every if name not in without}
-        try:
-            return Problem(made, stated.sensors, unknowns)
-        except ValueError as error:
-            raise ValueError(f"{config}{field}: {error}") from None
-
-    main = problem(Law(), "")
-    laws = {name: problem(law, f", compare.{name}") for name, law in stated.compare.items()}
-    if STATED in laws:
+    if STATED in stated.compare:
         raise ValueError(
             f"{config}, compare: the law of the file itself is called `{STATED}`; call the other "
             "one otherwise"
         )
-    return Case(main, stated, tables, {STATED: main, **laws} if laws else {})
+    laws = {
+        name: law_problem(f"{config}{field}", file, stated, law, entries, tables)
+        for name, law, field in (
+            (STATED, Law(), ""),
+            *((name, law, f", compare.{name}") for name, law in stated.compare.items()),
+        )
+    }
+    return Case(laws[STATED], stated, tables, laws if stated.compare else {})
+
+
+def law_problem(
+    place: str,
+    file: RigFile,
+    stated: Config,
+    law: Law,
+    entries: Mapping[str, tuple[Entry, list[Path]]],
+    tables: Mapping[str, Tables],
+) -> Problem:
+    """The problem with a competing law, which `place` states."""
+    made = []
+    for name, (entry, _) in entries.items():
+        settings = (stated.settings, entry.settings, law.settings)
+        try:
+            with at_field("settings"):
+                mine = reduce(RigFile.changed, settings, file)
+            start = entry.start or stated.start
+            made.append(rig_recording(mine, tables[name], name, stated.sensors, start))
+        except ValueError as error:
+            if any(str(table.path) in str(error) for table in tables[name].tables):
+                raise
+            raise ValueError(f"{place}, recording `{name}`: {error}") from None
+    full = made[0].rig.full
+    without = {full(name) for name in law.without}
+    unknowns = {full(name): one for name, one in (stated.unknowns | law.unknowns).items()}
+    with stated_in(place):
+        kept = {name: one for name, one in unknowns.items() if name not in without}
+        return Problem(made, stated.sensors, kept)
 
 
 def unreachable(error: Unreachable, tables: Mapping[str, Tables]) -> str:

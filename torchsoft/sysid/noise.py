@@ -153,39 +153,38 @@ def whitener(noise: Autoregression, times: bytes) -> sparse.csr_array:
     """`Autoregression.whitener`, made once for the same samples."""
     t = np.frombuffer(times)
     k, regular = positions(t, noise.spacing)
-    m, p = len(t), noise.order
-    if p == 0:
-        return sparse.csr_array(sparse.diags_array(np.full(m, 1 / noise.scale)))
-    if not regular and (p > 1 or noise.phi[0] < 0):
+    if noise.order == 0:
+        return sparse.csr_array(sparse.diags_array(np.full(len(t), 1 / noise.scale)))
+    if regular:
+        return gapped_whitener(noise, k.astype(int))
+    if noise.order > 1 or noise.phi[0] < 0:
         raise ValueError(
-            f"noise of order {p} is known every {noise.spacing:g} s only, but the samples are "
-            "not on such a grid"
+            f"noise of order {noise.order} is known every {noise.spacing:g} s only, but the "
+            "samples are not on such a grid"
         )
-    if not regular:
-        rho = noise.phi[0] ** np.diff(k)
-        sd = noise.sd * np.sqrt(np.concatenate(([1.0], 1 - rho**2)))
-        below: Any = (0, -1)
-        return sparse.csr_array(sparse.diags_array([1 / sd, -rho / sd[1:]], offsets=below))
-    grid = k.astype(int)
-    first = pasts(grid, p)
-    length = np.arange(m) - first + 1
-    own = (length == p + 1) & (grid - grid[first] == p)  # those whose past is the last p samples
-    values, known = np.tile(np.append(-np.array(noise.phi[::-1]), 1.0) / noise.scale, (m, 1)), {}
-    gamma, rows = noise.autocovariance(grid[-1] + 1), list[Array](values)
-    for i in np.flatnonzero(~own):
-        lags = grid[i] - grid[first[i] : i + 1]
+    rho = noise.phi[0] ** np.diff(k)
+    sd = noise.sd * np.sqrt(np.concatenate(([1.0], 1 - rho**2)))
+    below: Any = (0, -1)
+    return sparse.csr_array(sparse.diags_array([1 / sd, -rho / sd[1:]], offsets=below))
+
+
+def gapped_whitener(noise: Autoregression, grid: NDArray[np.int_]) -> sparse.csr_array:
+    """The whitener (m, m) for samples at grid points (m,). Its rows depend only on how far back the
+    past of a sample is."""
+    m, p, first = len(grid), noise.order, pasts(grid, noise.order)
+    gamma, rows = noise.autocovariance(grid[-1] + 1), list[Array]()
+    usual = np.append(-np.array(noise.phi[::-1]), 1.0) / noise.scale
+    known = {np.arange(p, -1, -1).tobytes(): usual, np.zeros(1, int).tobytes(): gamma[:1] ** -0.5}
+    for i, start in enumerate(first):
+        lags = grid[i] - grid[start : i + 1]
         key = lags.tobytes()
         if key not in known:
             K = gamma[np.abs(np.subtract.outer(lags, lags))]
-            past = (
-                linalg.solve(K[:-1, :-1], K[:-1, -1], assume_a="pos")
-                if len(lags) > 1
-                else np.zeros(0)
-            )
+            past = linalg.solve(K[:-1, :-1], K[:-1, -1], assume_a="pos")
             known[key] = np.append(-past, 1.0) / np.sqrt(K[-1, -1] - K[-1, :-1] @ past)
-        rows[i] = known[key]
-    ends = np.concatenate(([0], np.cumsum(length)))
-    columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], length)
+        rows.append(known[key])
+    ends = np.cumsum([0, *map(len, rows)])
+    columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], np.diff(ends))
     return sparse.csr_array((np.concatenate(rows), columns, ends), (m, m))
 
 
@@ -244,20 +243,21 @@ def fit_noise(
         candidates = [(), (by_time(series, h),)]
     out, scores = [], []
     for phi in candidates:
-        unit, q = Autoregression(phi, 1.0, h), len(phi) + 1
-        W = [unit.whitener(t) for t, _ in series]
-        square = sum(float(np.sum((w @ r) ** 2)) for w, (_, r) in zip(W, series))
+        square, log = whitened_sum(Autoregression(phi, 1.0, h), series)
         scale = max(square / max(m - parameters, 1.0), 1e-300) ** 0.5
-        deviance = 2 * m * np.log(scale) + sum(log_det(w) for w in W) + square / scale**2
+        deviance = 2 * m * np.log(scale) + log + square / scale**2
         out.append(Autoregression(phi, scale, h))
-        scores.append(
-            Score(
-                len(phi),
-                deviance,
-                deviance + q * np.log(m),
-            )
-        )
+        scores.append(Score(len(phi), deviance, deviance + (len(phi) + 1) * np.log(m)))
     return NoiseFit(out[int(np.argmin([score.bic for score in scores]))], tuple(scores))
+
+
+def whitened_sum(
+    noise: Autoregression, series: Sequence[tuple[Array, Array]]
+) -> tuple[float, float]:
+    """Sum of squares of residuals whitened with a noise, and the logarithm of the determinant of
+    its covariance."""
+    W = [(noise.whitener(t), r) for t, r in series]
+    return sum(float(np.sum((w @ r) ** 2)) for w, r in W), sum(log_det(w) for w, _ in W)
 
 
 def segments(t: Array, r: Array, h: float) -> list[Array]:
@@ -285,11 +285,12 @@ def by_time(series: Sequence[tuple[Array, Array]], h: float) -> float:
     """Maximum-likelihood correlation over h [s] of noise that decays exponentially with time."""
     m = sum(len(t) for t, _ in series)
 
+    def correlation(z: float) -> float:
+        return float(np.exp(-np.exp(-z)))
+
     def deviance(z: float) -> float:
-        unit = Autoregression((float(np.exp(-np.exp(-z))),), 1.0, h)
-        W = [unit.whitener(t) for t, _ in series]
-        square = sum(float(np.sum((w @ r) ** 2)) for w, (_, r) in zip(W, series))
-        return m * np.log(max(square, 1e-300)) + sum(log_det(w) for w in W)
+        square, log = whitened_sum(Autoregression((correlation(z),), 1.0, h), series)
+        return m * np.log(max(square, 1e-300)) + log
 
     found: Any = optimize.minimize_scalar(deviance, bounds=(-3.0, 9.0), method="bounded")
-    return float(np.exp(-np.exp(-found.x)))
+    return correlation(found.x)

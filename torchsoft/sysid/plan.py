@@ -35,6 +35,7 @@ from torchsoft.sysid.fit import (
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Mask
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.unknowns import Coordinate
 from torchsoft.tables import plain
 
 FIRST_LOOK = 0.1
@@ -100,38 +101,32 @@ def default_plan(
     """
     c, free = problem.coordinates, problem.coordinates.free & informative(problem, which)
     ratios = np.array([bool(one.ratio_to) for one in c.all]) & free
-    x, labels = tie_ratios(problem, c.start), np.array(c.labels, object)
+    tied_ratios, labels = [c.all[i] for i in np.flatnonzero(ratios)], np.array(c.labels, object)
     speed = {recording.name: recording.speed for recording in problem.recordings}
     order = sorted(which, key=lambda name: speed[name])
     loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
-    look = problem.residuals(runner, x, order[:1], loose, free)
+    look = problem.residuals(runner, tie_ratios(problem, c.start), order[:1], loose, free)
     if look.failed:
         raise Unreachable(look.failed)
-    ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
+    ties = tuple((one.label, one.high) for one in tied_ratios)
     slowest, first = (order[0],), tuple(labels[visible(look.J, free & ~ratios)])
     plan = [
         Stage(f"{order[0]}: first look", slowest, first, loose, FIRST, 1e-2, ties, starts=starts)
     ]
-    if len(order) > 1 or ratios.any():
-        plan.append(
-            Stage(
-                "all data, ratios tied",
-                tuple(order),
-                tuple(labels[free & ~ratios]),
-                loose,
-                ALL,
-                1e-2,
-            )
-        )
-    scans = tuple(
-        (c.all[i].label, tuple(part * c.all[i].high for part in SCANNED))
-        for i in np.flatnonzero(ratios)
-    )
-    every, last = (tuple(order), tuple(labels[free])), rtol >= USUAL
+    everything, tied = tuple(order), tuple(labels[free & ~ratios])
+    if len(order) > 1 or ties:
+        plan.append(Stage("all data, ratios tied", everything, tied, loose, ALL, 1e-2))
+    scans = scanned(tied_ratios)
+    every, last = (everything, tuple(labels[free])), rtol >= USUAL
     plan.append(Stage("everything", *every, usual, FREE, 1e-3 if last else 1e-2, scanned=scans))
     if not last:
         plan.append(Stage("everything, full tolerance", *every, rtol, LAST, 1e-3))
     return plan
+
+
+def scanned(ratios: Sequence[Coordinate]) -> tuple[tuple[str, tuple[float, ...]], ...]:
+    """Values to scan of ratios, by label."""
+    return tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in ratios)
 
 
 # Stages: ties, scans, starts, and a fit on frozen steps

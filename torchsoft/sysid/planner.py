@@ -42,11 +42,7 @@ from torchsoft.sysid.unknowns import in_full
 # Criteria of optimal design
 
 
-Optimality = Literal["D", "A", "worst"]
-
-SHARPNESS = 12.0
-"""Sharpness of the smooth maximum, which exceeds the largest logarithm by ln(parameters) over this
-at most."""
+Optimality = Literal["D", "A"]
 
 
 def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
@@ -54,8 +50,8 @@ def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
     standard deviation, the smaller the better, and its derivative (s, s) by C.
 
     "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root
-    mean square of the standard deviations; "worst" the largest of them, smoothed. With one
-    parameter the three are the same, and are called c-optimality. Raises `ValueError` for another.
+    mean square of the standard deviations. With one parameter both are the same, and are called
+    c-optimality. Raises `ValueError` for another.
     """
     if criterion not in get_args(Optimality):
         raise ValueError(
@@ -63,13 +59,8 @@ def optimality(criterion: Optimality, C: Array) -> tuple[float, Array]:
         )
     if criterion == "D":
         return 0.5 * float(np.linalg.slogdet(C)[1]) / len(C), 0.5 * np.linalg.inv(C) / len(C)
-    variances = np.diag(C)
-    if criterion == "A":
-        return 0.5 * float(np.log(variances.mean())), 0.5 * np.eye(len(C)) / variances.sum()
-    logs = 0.5 * np.log(variances)
-    parts = np.exp(SHARPNESS * (logs - logs.max()))
-    value = float(logs.max() + np.log(parts.sum()) / SHARPNESS)
-    return value, np.diag(0.5 * parts / parts.sum() / variances)
+    total = float(np.trace(C))
+    return 0.5 * float(np.log(total / len(C))), 0.5 * np.eye(len(C)) / total
 
 
 def chosen(
@@ -94,12 +85,6 @@ def chosen(
             f"{list(selected)}"
         )
     return selected, np.stack([rows[c.names.index(name)] for name in selected])
-
-
-def deviations(names: Sequence[str], T: Array, C: Array) -> dict[str, float]:
-    """Relative standard deviations of parameters, by the matrix T (s, n) of `chosen` and the
-    covariance C of the coordinates."""
-    return dict(zip(names, np.sqrt(np.diag(T @ C @ T.T)).tolist()))
 
 
 # Evaluation of a motion, and its gradient
@@ -136,15 +121,15 @@ PRICE = 5.0
 
 
 class DesignEvaluation(NamedTuple):
-    """One motion at one x: the criterion, the penalty `cost` of excess, the largest fraction of
-    their limits that channels reach, the covariance C (n, n), the `errors` (k, s) of the parameters
-    by nonlinear samples, the criterion's derivative G (n, n) by the Fisher matrix, the rows J (m,
-    n) of the samples, the steps, and the signals of the run."""
+    """One motion: the criterion, the penalty `cost` of excess, the largest fraction of their limits
+    that channels reach, the relative standard `deviations` of the parameters (s,), their `errors`
+    (k, s) by nonlinear samples, the criterion's derivative G (n, n) by the Fisher matrix, the rows
+    J (m, n) of the samples, the steps, and the signals of the run."""
 
     value: float
     cost: float
     peaks: dict[str, float]
-    C: Array
+    deviations: dict[str, float]
     errors: Array
     G: Array
     J: Array
@@ -153,7 +138,9 @@ class DesignEvaluation(NamedTuple):
 
 
 class Planner:
-    """The criterion of motions of one recording of a problem, and its gradient by their knots."""
+    """The criterion of motions of one recording of a problem at the nominal values of its unknowns,
+    and its gradient by their knots. Raises `ValueError` where the other recordings cannot be
+    run."""
 
     def __init__(
         self,
@@ -169,7 +156,8 @@ class Planner:
         self.problem, self.k, self.moves = problem, problem.names.index(plan), moves
         self.recording, self.rtol, self.workers = problem.recordings[self.k], rtol, workers
         self.criterion: Optimality = criterion
-        self.names, _ = chosen(problem, problem.coordinates.start, names)
+        self.x, self.free = problem.coordinates.start, problem.coordinates.free
+        self.names, self.T = chosen(problem, self.x, names)
         self.limits = in_full([self.recording.rig], limits)
         for channel, (low, high) in self.limits.items():
             if channel not in self.recording.channels or not low < high:
@@ -177,31 +165,21 @@ class Planner:
                     f"limits.{channel} = ({low:g}, {high:g}): a limit is (low, high) of a channel "
                     f"of the rig; {suggestion(channel, self.recording.channels, 'known:')}"
                 )
-        self.grid = self.recording.grid(problem.interpolated)
-        self._others = Runner(problem.recordings, workers)
-        self._known: dict[bytes, Array] = {}
+        self.grid, self.recorded = self.recording.grid(problem.interpolated), self._recorded()
         self._idle: list[RunContext] = []
         self.cost = Counter({"runs": 0, "gradients": 0})
 
-    def recorded(self, x: Array) -> Array:
-        """A square root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError`
-        where they cannot be run."""
-        if x.tobytes() not in self._known:
-            p, which = (
-                self.problem,
-                [name for name in self.problem.names if name != self.recording.name],
-            )
-            J = np.zeros((0, len(x)))
-            if which:
-                at = p.residuals(self._others, x, which, self.rtol, p.coordinates.free)
-                if at.failed:
-                    raise ValueError(
-                        f"a draw of the parameters does not reproduce what was recorded: "
-                        f"{at.reasons}"
-                    )
-                J = at.J[: len(at.J) - len(p.coordinates.priors)]
-            self._known[x.tobytes()] = np.linalg.qr(J)[1]
-        return self._known[x.tobytes()]
+    def _recorded(self) -> Array:
+        """A square root (.., n) of the Fisher matrix of the other recordings."""
+        p = self.problem
+        which = [name for name in p.names if name != self.recording.name]
+        if not which:
+            return np.zeros((0, len(self.x)))
+        runner = Runner(p.recordings, self.workers)
+        at = p.residuals(runner, self.x, which, self.rtol, self.free)
+        if at.failed:
+            raise ValueError(f"the nominal values do not reproduce what was recorded: {at.reasons}")
+        return np.linalg.qr(at.J[: len(at.J) - len(p.coordinates.priors)])[1]
 
     @contextmanager
     def _context(self) -> Iterator[RunContext]:
@@ -224,41 +202,40 @@ class Planner:
         self.cost["runs"] += 1
         return p.gather(x, [job], [run]), run
 
-    def evaluate(self, z: Array, x: Array, steps: Steps | None = None) -> DesignEvaluation:
-        """Evaluate the motion z at x, with the planner's tolerance or with `steps`; on frozen steps
+    def evaluate(self, z: Array, steps: Frozen | None = None) -> DesignEvaluation:
+        """Evaluate the motion z, with the planner's tolerance or with `steps`; on frozen steps
         without the errors. Raises `SimulationFailed`."""
-        c, given = self.problem.coordinates, self.rtol if steps is None else steps
-        at, run = self.run(z, x, given, c.free)
-        C = np.zeros((len(x), len(x)))
-        C[np.ix_(c.free, c.free)] = fisher(np.concatenate((self.recorded(x), at.J))[:, c.free])[0]
-        _, T = chosen(self.problem, x, self.names)
+        at, run = self.run(z, self.x, self.rtol if steps is None else steps, self.free)
+        C, T = np.zeros((len(self.x), len(self.x))), self.T
+        every = np.concatenate((self.recorded, at.J))[:, self.free]
+        C[np.ix_(self.free, self.free)] = fisher(every)[0]
         signals = Signals(run.t, self.recording.channels, run.signals, None)
-        self.check_predictable(x, at.J, signals)
-        errors = (
-            np.zeros((1, len(T)))
-            if isinstance(given, Frozen)
-            else self.errors(z, x, given, at, C, T)
-        )
-        spread = T @ C @ T.T + LEFT**2 * errors.T @ errors / len(errors)
+        self.check_predictable(at.J, signals)
+        errors = self.errors(z, at, C) if steps is None else np.zeros((1, len(T)))
+        spread = T @ C @ T.T
+        deviations = dict(zip(self.names, np.sqrt(np.diag(spread)).tolist()))
+        spread += LEFT**2 * errors.T @ errors / len(errors)
         value, S = optimality(self.criterion, spread)
         reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
-        peaks = {name: float(part.max()) for name, part in reached.items()}
-        cost = PRICE * sum(
-            float(np.sum(np.maximum(part - MARGIN, 0.0) ** 2)) for part in reached.values()
-        )
-        frozen = Frozen(run.knots) if run.knots is not None else given
-        assert isinstance(frozen, Frozen)
-        J = at.J[: len(at.J) - len(c.priors)]
+        excess = [np.maximum(part - MARGIN, 0.0) for part in reached.values()]
         return DesignEvaluation(
-            value, cost, peaks, C, errors, -C @ T.T @ S @ T @ C, J, frozen, signals
+            value,
+            PRICE * sum(float(np.sum(part**2)) for part in excess),
+            {name: float(part.max()) for name, part in reached.items()},
+            deviations,
+            errors,
+            -C @ T.T @ S @ T @ C,
+            at.J[: len(at.J) - len(self.problem.coordinates.priors)],
+            at.steps[self.recording.name],
+            signals,
         )
 
-    def check_predictable(self, x: Array, J: Array, signals: Signals) -> None:
+    def check_predictable(self, J: Array, signals: Signals) -> None:
         """Raises `SimulationFailed` where a small change of a parameter would change the samples
         completely: their information is then that of chaos, which no fit can use."""
         c, at = self.problem.coordinates, 0
         rig = [one.of_the_rig and one.scale == "log" for one in c.all]
-        for channel, one in self.problem.readouts(x, self.k).items():
+        for channel, one in self.problem.readouts(self.x, self.k).items():
             t, _ = self.recording.samples[channel]
             most = np.abs(one.expected(signals, t)[0]).max() / self.problem.sensors[channel].noise
             of = np.abs(J[at : at + len(t)]).max(0) * rig / max(most, 1.0)
@@ -271,17 +248,17 @@ class Planner:
                 )
             at += len(t)
 
-    def errors(self, z: Array, x: Array, rtol: float, at: Residuals, C: Array, T: Array) -> Array:
+    def errors(self, z: Array, at: Residuals, C: Array) -> Array:
         """Relative errors (k, s) of the parameters after one noiseless Gauss-Newton step from a
         standard deviation away, at points of different signs, each on its own steps: zero where
         samples are linear over an interval and steps fine enough, large where the motion is
         chaotic. Raises `SimulationFailed`."""
-        out, (low, high) = [], self.problem.coordinates.bounds
+        out, (low, high), T = [], self.problem.coordinates.bounds, self.T
         sd = np.minimum(np.sqrt(np.diag(T @ C @ T.T)), FARTHEST)
         for k in range(TRIED):
             signs = (-1.0) ** (np.arange(len(T)) // 2**k)
-            off = np.clip(x + np.linalg.pinv(T) @ (signs * sd), low, high) - x
-            there, _ = self.run(z, x + off, rtol, None)
+            off = np.clip(self.x + np.linalg.pinv(T) @ (signs * sd), low, high) - self.x
+            there, _ = self.run(z, self.x + off, self.rtol, None)
             out.append(T @ C @ at.J.T @ (there.r - at.r - at.J @ off))
         return np.array(out)
 
@@ -293,16 +270,12 @@ class Planner:
             for name, (low, high) in self.limits.items()
         }
 
-    def slopes(self, z: Array, x: Array, at: DesignEvaluation) -> Array:
+    def slopes(self, z: Array, at: DesignEvaluation) -> Array:
         """Gradient by z of the criterion and of the penalty, on the steps of the evaluation. Raises
         `SimulationFailed`."""
-        c, W = self.problem.coordinates, 2 * at.J @ at.G
-        low, high = c.bounds
-        tasks, beside = (
-            list[tuple[Array, Array]](),
-            self.overload(at.signals),
-        )  # points x, weights on the signals there
-        for j in np.flatnonzero(c.free & (np.abs(at.J).max(0) > 0)):
+        c, x, W, tasks = self.problem.coordinates, self.x, 2 * at.J @ at.G, []
+        (low, high), here = c.bounds, self.overload(at.signals)  # weights on the signals at x
+        for j in np.flatnonzero(self.free & (np.abs(at.J).max(0) > 0)):
             ahead, behind = x.copy(), x.copy()
             ahead[j], behind[j] = min(x[j] + DIFFERENCE, high[j]), max(x[j] - DIFFERENCE, low[j])
             w = W[:, j] / (ahead[j] - behind[j])
@@ -310,9 +283,9 @@ class Planner:
                 weights = self.pulled(x, at.signals, w)
                 tasks += [(ahead, weights), (behind, -weights)]
             else:  # the run is the same, only what a sensor makes of it is not
-                beside += self.pulled(ahead, at.signals, w) - self.pulled(behind, at.signals, w)
-        if beside.any():
-            tasks.append((x, beside))
+                here += self.pulled(ahead, at.signals, w) - self.pulled(behind, at.signals, w)
+        if here.any():
+            tasks.append((x, here))
 
         def swept(i: int) -> Array:
             return self.adjoint(z, tasks[i][0], at.steps, tasks[i][1])
@@ -350,7 +323,7 @@ class Planner:
             _, weight = one.residuals(one.expected(signals, t)[0], measured)
             v, noise = w[at : at + len(t)], self.problem.noise.get(channel)
             v = v if noise is None else noise.whitener(t).T @ v
-            out = out + one.pulled_back(signals, t, weight * v)
+            out += one.pulled_back(signals, t, weight * v)
             at += len(t)
         return out
 
@@ -363,25 +336,12 @@ class Planner:
             out[:, signals.names.index(name)] = 4 * PRICE * excess / (high - low)
         return out
 
-    def deviations(self, x: Array, at: DesignEvaluation) -> dict[str, float]:
-        """Relative standard deviations of the parameters."""
-        names, T = chosen(self.problem, x, self.names)
-        return deviations(names, T, at.C)
-
-    def linearization_error(self, x: Array, at: DesignEvaluation) -> dict[str, Array]:
-        """Errors (k,) by parameter, over its standard deviation."""
-        return {
-            name: error / sd
-            for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)
-        }
-
-    def made(self, z: Array, x: Array, at: DesignEvaluation) -> Recording:
+    def made(self, z: Array, at: DesignEvaluation) -> Recording:
         """The recording of a motion, with the noiseless samples of its sensors."""
-        rig = deepcopy(self.recording.rig)
+        rig, samples = deepcopy(self.recording.rig), {}
         with torch.no_grad():
             rig.reference = self.moves.reference(torch.from_numpy(z))
-        samples = {}
-        for channel, one in self.problem.readouts(x, self.k).items():
+        for channel, one in self.problem.readouts(self.x, self.k).items():
             t, _ = self.recording.samples[channel]
             samples[channel] = t, one.expected(at.signals, t)[0]
         return replace(self.recording, rig=rig, samples=samples)

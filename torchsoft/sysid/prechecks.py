@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.names import effort_channel
@@ -29,12 +29,47 @@ from torchsoft.sysid.sentences import Finding
 from torchsoft.sysid.unknowns import Sensor
 from torchsoft.tables import shown
 
-# Checks of recorded set-points: their spacing in time, and the agreement of rates with values.
-#
-# A recorded signal is known at its rows only, with a cubic between them. The error of the cubic
-# is estimated from that of the cubic through every second row, and from that with other rates, of a
-# spline through the values. It is stated by its effect: the error of the set-point over the noise
-# of that coordinate's sensor, and that of the effort over the noise of the force.
+Expected = Mapping[str, tuple[Readout, Signals]]
+"""Readouts of a run, with its signals, by channel."""
+
+
+def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
+    """Findings on some recordings of a problem, by default all: one for each name."""
+    every, x = list[Finding](), problem.coordinates.start
+    which = problem.names if which is None else which
+    unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
+    jobs = problem.jobs(x, which, LOOSE, None)
+    with warnings.catch_warnings(action="ignore"):  # of motions that a mistake makes violent
+        runs = runner.run(jobs)
+    for job, run in zip(jobs, runs):
+        recording, expected = problem.recordings[job.recording], {}
+        if isinstance(run, Prediction):
+            signals = Signals(run.t, recording.channels, run.signals, None)
+            readouts = problem.readouts(x, job.recording)
+            expected = {name: (one, signals) for name, one in readouts.items()}
+        every += findings(recording, problem.sensors, expected, unknown)
+    return together(every)
+
+
+def findings(
+    recording: Recording,
+    sensors: Mapping[str, Sensor],
+    expected: Expected,
+    unknown: Collection[str] = (),
+) -> list[Finding]:
+    """Findings on one recording, compared with the readouts `expected` of a run from the start,
+    if there is one; `unknown` are the names of unknown parameters. A recording with an error is not
+    compared with the run."""
+    here = {name: one for name, one in sensors.items() if name in recording.samples}
+    every = [*setpoint_findings(recording, here), *noise_findings(recording, here)]
+    every += resolution_findings(recording, here)
+    for more in (
+        run_findings(recording, here, expected),
+        controller_findings(recording, here, unknown),
+    ):
+        if not any(one.severity == "error" for one in every):
+            every += more
+    return every
 
 
 def found(code: str, name: str, recording: Recording, grave: bool = False, **facts: Any) -> Finding:
@@ -43,10 +78,51 @@ def found(code: str, name: str, recording: Recording, grave: bool = False, **fac
     return Finding(code, "error" if grave else "warning", facts)
 
 
+def together(every: Sequence[Finding]) -> list[Finding]:
+    """One finding for each name: the gravest, with the names of the other recordings."""
+    out = list[Finding]()
+    for name in dict.fromkeys(one.facts["name"] for one in every):
+        mine = [one for one in every if one.facts["name"] == name]
+        first, *others = sorted(mine, key=lambda one: one.severity)
+        alike = dict.fromkeys(f"`{one.facts['recording']}`" for one in others)
+        alike.pop(f"`{first.facts['recording']}`", None)
+        more = {"others_alike": [*alike]} if alike else {}
+        out.append(replace(first, facts=first.facts | more))
+    return out
+
+
+def accepted(every: Sequence[Finding], acknowledged: Sequence[str]) -> list[Finding]:
+    """Findings on recordings, those that are acknowledged as notes. Raises `ValueError` for other
+    errors, and for an acknowledged name without a finding."""
+    names = dict.fromkeys(one.facts["name"] for one in every)
+    if strange := [name for name in acknowledged if name not in names]:
+        there = f"the findings are {', '.join(names)}" if names else "nothing looks wrong"
+        raise ValueError(
+            f"acknowledged: there is no finding {shown(strange[0])}, so leave it out; {there}"
+        )
+    for one in every:
+        if one.severity == "error" and one.facts["name"] not in acknowledged:
+            raise ValueError(f'{one} If it is right, say acknowledged = ["{one.facts["name"]}"]')
+    return [replace(one, severity="note") for one in every]
+
+
 def channel(rig: Rig, name: str) -> str:
     """Channel of a coordinate such as "disc.x", or of the effort of an actuator such as "x"."""
     body, _, axis = name.partition(".")
     return f"{axis}_{rig.symbols[body]}" if axis else effort_channel(body)
+
+
+def rms(values: Array) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+# Set-points: their spacing in time, and the agreement of rates with values.
+#
+# A recorded signal is known at its rows only, with a cubic between them. The error of the cubic
+# is estimated from that of the cubic through every second row, and from that with other rates, of a
+# spline through the values. It is stated by its effect: the error of the set-point over the noise
+# of that coordinate's sensor, and that of the effort over the noise of the force.
 
 
 NOTICED = 0.2
@@ -76,90 +152,44 @@ class Gap(NamedTuple):
     noises: float
 
 
-def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
-    """The signal at every so-many-th row; rates that were `derived` from all rows are derived from
-    these."""
-    rates = None if derived else signal.rates.detach()[::every]
-    return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
-
-
-def is_derived(signal: Sampled) -> bool:
-    """Whether the rates are those of the spline through the values."""
-    own = spline_rates(signal.times, signal.values)
-    return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
-
-
-def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
-    """Errors between rows of an actuator's set-point, in the channels with sensors."""
-    rig, out = recording.rig, []
-    actuator = rig.actuators[name]
-    signal = rig.reference[actuator.setpoint]
-    if not isinstance(signal, Sampled) or len(signal.times) < 9:
-        return []
-    feed = rig.reference[actuator.feed_forward] if actuator.feed_forward else None
-    t, derived = signal.times, is_derived(signal)
-    inside = torch.cat([t[:-1] + part * t.diff() for part in PARTS]).sort().values
-    inside = inside[inside <= t[2 * ((len(t) - 1) // 2)]]
-    x, v = signal(inside)
-    places, efforts = list[Tensor](), list[Tensor]()
-    for every, without_rates in ((1, derived), (2, derived), (1, True)):
-        place, rate = cubic(signal, every, without_rates)(inside)
-        places.append(place)
-        efforts.append(demanded(actuator, feed, every, inside, place, rate, x, v))
-    for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
-        if own in sensors and own in recording.samples:
-            sparser, other_rates = (float((one - by[0]).square().mean().sqrt()) for one in by[1:])
-            error = max(sparser / (2**ORDER - 1), other_rates)
-            out.append(Gap(own, error, error / sensors[own].sd))
-    return out
-
-
-@torch.no_grad()
-def demanded(
-    actuator: Actuator,
-    feed: nn.Module | None,
-    every: int,
-    t: Tensor,
-    place: Tensor,
-    rate: Tensor,
-    x: Tensor,
-    v: Tensor,
-) -> Tensor:
-    """Effort (n,) of the controller for a set-point, with its coordinate at x and its rate at v."""
-    known = cubic(feed, every, is_derived(feed)) if isinstance(feed, Sampled) else feed
-    more = () if known is None else known(t)
-    return actuator(torch.stack((place, rate, *more, x, v), -1))
-
-
 def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
     """Findings on the set-points of a recording. For controllers of several coordinates only
     rates are tested here."""
     rig = recording.rig
+    setpoints = {name for one in rig.actuators.values() for name in one.setpoints}
     recorded = {
-        n
-        for one in rig.actuators.values()
-        for n in one.setpoints
-        if isinstance(rig.reference[n], Sampled)
+        name: signal
+        for name in sorted(setpoints)
+        if isinstance(signal := rig.reference[name], Sampled)
     }
-    findings = {name: other_rate(recording, name) for name in sorted(recorded)}
-    yield from (one for one in findings.values() if one is not None)
+    wrong = {name: rate_findings(recording, name, one) for name, one in recorded.items()}
+    for finding in wrong.values():
+        yield from finding
     for name, actuator in rig.loops.items():
-        if actuator.setpoint in recorded and findings[actuator.setpoint] is None:
-            sparse = sparse_finding(recording, sensors, name)
-            if sparse is not None:
-                yield sparse
+        if actuator.setpoint in recorded and not wrong[actuator.setpoint]:
+            signal = recorded[actuator.setpoint]
+            worst = max(gaps(recording, sensors, name), key=lambda gap: gap.noises, default=None)
+            if worst is not None and worst.noises > NOTICED:
+                yield sparse(recording, actuator.setpoint, signal, worst)
 
 
-def sparse_finding(
-    recording: Recording, sensors: Mapping[str, Sensor], name: str
-) -> Finding | None:
+def rate_findings(recording: Recording, setpoint: str, signal: Sampled) -> list[Finding]:
+    """A finding on rates unlike those of the values."""
+    times, values = signal.times, signal.values.detach()
+    given, own = signal.rates.detach().numpy(), spline_rates(times, values).numpy()
+    fewer = spline_rates(times[::2], values[::2]).numpy()
+    size, off = rms(own), rms(given - own)
+    unsure = rms(fewer - own[::2]) > OTHER_RATE / 2 * size
+    if unsure or off <= OTHER_RATE * max(size, rms(given)):
+        return []
+    factor = float(given @ own) / max(float(own @ own), 1e-300)
+    looks = {"opposite" if factor < 0 else "factor": factor}
+    facts = {"setpoint": setpoint, "off": off, "size": size} | looks
+    return [found("rate", f"rate of {setpoint}", recording, True, **facts)]
+
+
+def sparse(recording: Recording, setpoint: str, signal: Sampled, worst: Gap) -> Finding:
     """Finding on set-points that are too far apart in time."""
-    gap_list = gaps(recording, sensors, name)
-    if not gap_list or (worst := max(gap_list, key=lambda gap: gap.noises)).noises <= NOTICED:
-        return None
-    setpoint = recording.rig.actuators[name].setpoint
-    signal = recording.rig.reference[setpoint]
-    assert isinstance(signal, Sampled)
     apart = 1e3 * float(signal.times.diff().max())
     return found(
         "set-points",
@@ -177,57 +207,113 @@ def sparse_finding(
     )
 
 
-def other_rate(recording: Recording, setpoint: str) -> Finding | None:
-    """Finding on rates unlike those of the values."""
-    signal = recording.rig.reference[setpoint]
-    assert isinstance(signal, Sampled)
-    times, values = signal.times, signal.values.detach()
-    given, own = signal.rates.detach().numpy(), spline_rates(times, values).numpy()
-    fewer = spline_rates(times[::2], values[::2]).numpy()
-    size, off, unsure = (
-        float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2])
-    )
-    if (
-        off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2))))
-        or unsure > OTHER_RATE / 2 * size
-    ):
-        return None
-    factor = float(given @ own) / max(float(own @ own), 1e-300)
-    looks = {"opposite" if factor < 0 else "factor": factor}
-    name = f"rate of {setpoint}"
-    return found("rate", name, recording, True, setpoint=setpoint, off=off, size=size, **looks)
+def is_derived(signal: Sampled) -> bool:
+    """Whether the rates are those of the spline through the values."""
+    own = spline_rates(signal.times, signal.values)
+    return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
 
 
-# Signs, units, loops and noise
+def thinned(signal: Any, every: int, other_rates: bool) -> Any:
+    """A recorded signal at every so-many-th row, with its own rates or those of a spline through
+    the values; other signals as they are."""
+    if not isinstance(signal, Sampled):
+        return signal
+    rates = None if other_rates or is_derived(signal) else signal.rates.detach()[::every]
+    return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
 
 
-def together(every: Sequence[Finding]) -> list[Finding]:
-    """One finding for each name: the gravest, with the names of the other recordings."""
-    out = list[Finding]()
-    for name in dict.fromkeys(one.facts["name"] for one in every):
-        mine = [one for one in every if one.facts["name"] == name]
-        first, *others = sorted(mine, key=lambda one: one.severity)
-        alike = dict.fromkeys(one.facts["recording"] for one in others)
-        alike.pop(first.facts["recording"], None)
-        more = {"others_alike": [f"`{one}`" for one in alike]} if alike else {}
-        out.append(replace(first, facts=first.facts | more))
+@torch.no_grad()
+def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
+    """Errors between rows of an actuator's set-point, in the channels with sensors."""
+    rig, actuator = recording.rig, recording.rig.actuators[name]
+    signal = rig.reference[actuator.setpoint]
+    if not isinstance(signal, Sampled) or len(signal.times) < 9:
+        return []
+    t, signals = signal.times, [rig.reference[one] for one in actuator.reads]
+    inside = torch.cat([t[:-1] + part * t.diff() for part in PARTS]).sort().values
+    inside = inside[inside <= t[2 * ((len(t) - 1) // 2)]]
+    seen, places, efforts = signal(inside), list[Tensor](), list[Tensor]()
+    for every, other_rates in ((1, False), (2, False), (1, True)):
+        asked = [x for one in signals for x in thinned(one, every, other_rates)(inside)]
+        places.append(asked[0])
+        efforts.append(actuator(torch.stack((*asked, *seen), -1)))
+    out = list[Gap]()
+    for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
+        if own in sensors:
+            sparser, other = (rms((one - by[0]).numpy()) for one in by[1:])
+            error = max(sparser / (2**ORDER - 1), other)
+            out.append(Gap(own, error, error / sensors[own].sd))
     return out
 
 
-def accepted(every: Sequence[Finding], acknowledged: Sequence[str]) -> list[Finding]:
-    """Findings on recordings, those that are acknowledged as notes. Raises `ValueError` for other
-    errors, and for an acknowledged name without a finding."""
-    names = dict.fromkeys(one.facts["name"] for one in every)
-    if strange := [name for name in acknowledged if name not in names]:
-        there = f"the findings are {', '.join(names)}" if names else "nothing looks wrong"
-        raise ValueError(
-            f"acknowledged: there is no finding {shown(strange[0])}, so leave it out; {there}"
-        )
-    for one in every:
-        if one.severity == "error" and one.facts["name"] not in acknowledged:
-            raise ValueError(f'{one} If it is right, say acknowledged = ["{one.facts["name"]}"]')
-    return [replace(one, severity="note") for one in every]
+# Noise and resolution
 
+
+COARSE = 1.2
+"""Least ratio of a sensor's quantisation to its noise for a warning; it widens the noise by 6 % and
+more."""
+
+ENOUGH, WIDTH = 10, 0.5
+"""Samples of a channel whose range, over their noise, is not smaller than that by chance."""
+
+
+def noise_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
+    """Noise that is stated so large that samples could not be as near to each other as they are."""
+    for name, sensor in sensors.items():
+        y = recording.samples[name][1]
+        if len(y) < ENOUGH:
+            continue
+        if np.ptp(y) == 0 and sensor.resolution < sensor.noise and not sensor.saturated(y).any():
+            yield constant(recording, name, noise=sensor.noise)
+        elif 0 < np.ptp(y) < WIDTH * sensor.noise:
+            facts = {"noise": sensor.noise, "range": float(np.ptp(y))}
+            facts |= {"channel": name, "unit": recording.units[name]}
+            yield found("noise", f"noise of {name}", recording, True, **facts)
+
+
+def constant(recording: Recording, name: str, **contradiction: float) -> Finding:
+    """Finding on a channel whose samples are all equal, with what contradicts that: the stated
+    `noise`, or the motion of a `run`."""
+    y, unit = recording.samples[name][1], recording.units[name]
+    facts = {"channel": name, "value": float(y[0]), "unit": unit, "samples": len(y)}
+    return found("constant", f"constant {name}", recording, True, **facts, **contradiction)
+
+
+def resolution_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
+    """Warnings on quantised readings whose steps the stated noise and resolution omit."""
+    for name, sensor in sensors.items():
+        apart = np.diff(np.unique(unsaturated(recording, sensor, name)[1]))
+        q = float(apart.min(initial=math.inf))
+        if not COARSE * max(sensor.noise, sensor.resolution) < q < math.inf:
+            continue
+        if np.abs(apart / q - np.round(apart / q)).max() < 1e-3:
+            facts = {"step": q, "unit": recording.units[name], "ratio": q / sensor.noise}
+            yield found("resolution", f"resolution of {name}", recording, channel=name, **facts)
+
+
+def unsaturated(recording: Recording, sensor: Sensor, name: str) -> tuple[Array, Array]:
+    """Times and values of a channel's unsaturated samples."""
+    t, y = recording.samples[name]
+    inside = ~sensor.saturated(y)
+    return t[inside], y[inside]
+
+
+# Signs and units
+
+
+MOVES = 5.0
+"""Least motion of a channel, over its noise, for a judgement."""
+
+OPPOSITE = -0.5
+"""Correlation with the run below which a sign counts as opposite, beyond the effect of wrong
+parameters."""
+
+LARGER = 8.0
+"""Factor between the sizes of motions above which wrong parameters, off by three, are no
+explanation."""
+
+NEAR = math.log(4.0)
+"""Largest difference of the logarithm of such a factor from that of confused units."""
 
 MISTAKEN = {
     "rad": {180 / math.pi: ("degrees", "radians"), 1e3: ("milliradians", "radians")},
@@ -248,20 +334,53 @@ def confusions(unit: str) -> list[tuple[float, str]]:
     return over + [(1 / factor, f"{b} taken for {a}") for factor, (a, b) in known.items()]
 
 
+def run_findings(
+    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
+) -> Iterator[Finding]:
+    """Findings on channels whose sign or unit contradicts the run."""
+    for name, (one, signals) in expected.items():
+        (t, y), least = unsaturated(recording, sensors[name], name), MOVES * sensors[name].sd
+        if len(t) < 2 * MOVES:
+            continue
+        p = one.expected(signals, t)[0]
+        measured, run = float(np.std(y)), float(np.std(p))
+        ratio = measured / max(run, 1e-300)
+        if max(measured, run) < least:
+            continue
+        if measured == 0:
+            yield constant(recording, name, run=run)
+        elif run > 0 and not 1 / LARGER < ratio < LARGER:
+            yield size_finding(recording, name, ratio)
+        elif min(measured, run) >= least:
+            alike = float(np.mean((y - y.mean()) * (p - p.mean()))) / (measured * run)
+            if alike < OPPOSITE:
+                more = {"channel": name, "correlation": alike}
+                yield found("sign", f"sign of {name}", recording, True, **more)
+
+
+def size_finding(recording: Recording, name: str, ratio: float) -> Finding:
+    """Finding on a channel that moves by a `ratio` more than the run: its unit is another one,
+    where that explains it, or the parameters are wrong."""
+    known = [
+        (abs(math.log(ratio / factor)), confusion)
+        for factor, confusion in confusions(recording.units[name])
+    ]
+    distance, confusion = min(known, default=(math.inf, ""))
+    facts = {"channel": name, "ratio": ratio}
+    if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
+        return found("unit", f"unit of {name}", recording, True, **facts, confusion=confusion)
+    return found("size", f"size of {name}", recording, **facts)
+
+
+# Controllers
+
+
 FEWEST = 8
 """Fewest samples for a judgement of a controller."""
 
 ROUGH = 0.03
 """Relative difference, besides the noise, between a force and its controller's law that counts as
 normal: drives are not exact."""
-
-
-def comparable(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> bool:
-    """Whether a channel has samples of a sensor without inertia, misalignment or saturation."""
-    if name not in recording.samples or name not in sensors:
-        return False
-    one, y = sensors[name], recording.samples[name][1]
-    return one.inertia == 0 and one.misalignment == 0 and not one.saturated(y).any() and len(y) > 3
 
 
 def controller_findings(
@@ -276,37 +395,60 @@ def controller_findings(
         force, *others = every = [channel(rig, one) for one in (name, *actuator.measures)]
         lacking = [one for one in every if not comparable(recording, sensors, one)]
         if lacking and force not in lacking and not actuator.is_loop:
-            name = f"controller of {force}"
-            one = found("not-compared", name, recording, force=force, lacking=lacking[0])
+            facts = {"force": force, "lacking": lacking[0]}
+            one = found("not-compared", f"controller of {force}", recording, **facts)
             yield replace(one, severity="note")
         faults = [(s.bias, s.delay, s.gain, s.drift) for s in map(sensors.get, every) if s]
         if lacking or np.any(faults) or any(id(p) in tensors for p in actuator.parameters()):
             continue
-        t, F = recording.samples[force]
-        for at, _ in (recording.samples[one] for one in others):  # not in a gap
-            reach = 2 * float(np.median(np.diff(at)))
-            near = np.searchsorted(at, t + reach) > np.searchsorted(at, t - reach)
-            t, F = t[near], F[near]
-        if len(t) < FEWEST:
-            continue
-        read = [part for one in actuator.reads for part in rig.reference[one](torch.tensor(t))]
-        feed = actuator.feed_forward
-        splines = [CubicSpline(*recording.samples[one]) for one in others]
-        seen = [torch.from_numpy(s(t, order)) for s in splines for order in (0, 1)]
-        inputs = torch.stack((*read, *seen), -1).detach().requires_grad_(True)
-        given = actuator(inputs)
-        (slopes,) = torch.autograd.grad(given.sum(), inputs)
-        by = slopes[:, len(read) :: 2].square().mean(0).tolist()
-        noise = [sensors[force].noise ** 2]
-        noise += [slope * sensors[one].noise ** 2 for slope, one in zip(by, others)]
-        apart = F - given.detach().numpy()
-        apart -= shift_of_start(recording, actuator, t, apart, slopes[:, 0].numpy())
-        off = float(np.mean(apart))
-        if abs(off) <= 2 * sum(noise) ** 0.5 + ROUGH * float(np.sqrt(np.mean(F**2))):
-            continue
-        ask = {"feed": feed} if feed else {"loop": f"the actuator {name}"}
-        more: dict[str, Any] = {"force": force, "off": off, "unit": actuator.effort_unit} | ask
-        yield found("controller", feed or f"loop of {force}", recording, **more)
+        off, usual = mean_difference(recording, sensors, actuator, force, others)
+        if abs(off) > usual:
+            feed = actuator.feed_forward
+            ask = {"feed": feed} if feed else {"loop": f"the actuator {name}"}
+            facts = {"force": force, "off": off, "unit": actuator.effort_unit} | ask
+            yield found("controller", feed or f"loop of {force}", recording, **facts)
+
+
+def comparable(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> bool:
+    """Whether a channel has samples of a sensor without inertia, misalignment or saturation."""
+    if name not in recording.samples or name not in sensors:
+        return False
+    one, y = sensors[name], recording.samples[name][1]
+    return one.inertia == 0 and one.misalignment == 0 and not one.saturated(y).any() and len(y) > 3
+
+
+def mean_difference(
+    recording: Recording,
+    sensors: Mapping[str, Sensor],
+    actuator: Actuator,
+    force: str,
+    others: Sequence[str],
+) -> tuple[float, float]:
+    """Mean difference [N or N.m] of a recorded `force` from that of its actuator at the recorded
+    coordinates `others`, and the difference that noise and an inexact drive may cause. Both are
+    zero for too few samples."""
+    t, F = recording.samples[force]
+    for at, _ in (recording.samples[one] for one in others):  # not in a gap
+        reach = 2 * float(np.median(np.diff(at)))
+        near = np.searchsorted(at, t + reach) > np.searchsorted(at, t - reach)
+        t, F = t[near], F[near]
+    if len(t) < FEWEST:
+        return 0.0, 0.0
+    asked = [
+        part for one in actuator.reads for part in recording.rig.reference[one](torch.tensor(t))
+    ]
+    splines = [CubicSpline(*recording.samples[one]) for one in others]
+    seen = [torch.from_numpy(s(t, order)) for s in splines for order in (0, 1)]
+    inputs = torch.stack((*asked, *seen), -1).detach().requires_grad_(True)
+    given = actuator(inputs)
+    (slopes,) = torch.autograd.grad(given.sum(), inputs)
+    by = slopes[:, len(asked) :: 2].square().mean(0).tolist()
+    noise = [slope * sensors[one].noise ** 2 for slope, one in zip(by, others)]
+    apart = F - given.detach().numpy()
+    apart -= shift_of_start(recording, actuator, t, apart, slopes[:, 0].numpy())
+    return float(np.mean(apart)), 2 * (sensors[force].noise ** 2 + sum(noise)) ** 0.5 + ROUGH * rms(
+        F
+    )
 
 
 def shift_of_start(
@@ -322,148 +464,3 @@ def shift_of_start(
     weights = torch.tensor(followed.weights, dtype=torch.float64).expand(signal.values.shape)
     by_start = slope * signal.with_values(weights)(torch.tensor(t))[0].detach().numpy()
     return float(np.mean(apart[:FEWEST] / slope[:FEWEST])) * by_start
-
-
-MOVES = 5.0
-"""Least motion of a channel, over its noise, for a judgement."""
-
-OPPOSITE = -0.5
-"""Correlation with the run below which a sign counts as opposite, beyond the effect of wrong
-parameters."""
-
-LARGER = 8.0
-"""Factor between the sizes of motions above which wrong parameters, off by three, are no
-explanation."""
-
-NEAR = math.log(4.0)
-"""Largest difference of the logarithm of such a factor from that of confused units."""
-
-Expected = Mapping[str, tuple[Readout, Signals]]
-"""Readouts of a run, with its signals, by channel."""
-
-
-def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
-    """Findings on some recordings of a problem, by default all: one for each name."""
-    every, x = list[Finding](), problem.coordinates.start
-    which = problem.names if which is None else which
-    unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
-    jobs = problem.jobs(x, which, LOOSE, None)
-    with warnings.catch_warnings(action="ignore"):  # of motions that a mistake makes violent
-        runs = runner.run(jobs)
-    for job, got in zip(jobs, runs):
-        recording, expected = problem.recordings[job.recording], {}
-        if isinstance(got, Prediction):
-            signals = Signals(got.t, recording.channels, got.signals, None)
-            expected = {
-                name: (one, signals) for name, one in problem.readouts(x, job.recording).items()
-            }
-        every += findings(recording, problem.sensors, expected, unknown)
-    return together(every)
-
-
-def findings(
-    recording: Recording,
-    sensors: Mapping[str, Sensor],
-    expected: Expected,
-    unknown: Collection[str] = (),
-) -> list[Finding]:
-    """Findings on one recording, compared with the readouts `expected` of a run from the start,
-    if there is one; `unknown` are the names of unknown parameters. A recording with an error is not
-    compared with the run."""
-    every = [*setpoint_findings(recording, sensors), *noisy(recording, sensors)]
-    every += rounded(recording, sensors)
-    for more in (
-        against_run(recording, sensors, expected),
-        controller_findings(recording, sensors, unknown),
-    ):
-        if not any(one.severity == "error" for one in every):
-            every += more
-    return every
-
-
-COARSE = 1.2
-"""Least ratio of a sensor's quantisation to its noise for a warning; it widens the noise by 6 % and
-more."""
-
-
-ENOUGH, WIDTH = 10, 0.5
-"""Samples of a channel whose range, over their noise, is not smaller than that by chance."""
-
-
-def noisy(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
-    """Noise that is stated so large that samples could not be as near to each other as they are."""
-    for name, sensor in sensors.items():
-        y = recording.samples[name][1] if name in recording.samples else np.zeros(0)
-        if len(y) < ENOUGH:
-            continue
-        unit = recording.units[name]
-        if np.ptp(y) == 0 and sensor.resolution < sensor.noise and not sensor.saturated(y).any():
-            yield constant(recording, name, noise=sensor.noise)
-        elif 0 < np.ptp(y) < WIDTH * sensor.noise:
-            facts = {"noise": sensor.noise, "range": float(np.ptp(y)), "unit": unit}
-            yield found("noise", f"noise of {name}", recording, True, channel=name, **facts)
-
-
-def constant(recording: Recording, name: str, **contradiction: float) -> Finding:
-    """Finding on a channel whose samples are all equal, with what contradicts that: the stated
-    `noise`, or the motion of a `run`."""
-    y, unit = recording.samples[name][1], recording.units[name]
-    facts = {"channel": name, "value": float(y[0]), "unit": unit, "samples": len(y)}
-    return found("constant", f"constant {name}", recording, True, **facts, **contradiction)
-
-
-def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
-    """Warnings on quantised readings whose steps the stated noise and resolution omit."""
-    for name, sensor in sensors.items():
-        if name not in recording.samples:
-            continue
-        apart = np.diff(np.unique(unsaturated(recording, sensors, name)[1]))
-        q = float(apart.min(initial=math.inf))
-        if not COARSE * max(sensor.noise, sensor.resolution) < q < math.inf:
-            continue
-        if np.abs(apart / q - np.round(apart / q)).max() < 1e-3:
-            facts = {"step": q, "unit": recording.units[name], "ratio": q / sensor.noise}
-            yield found("resolution", f"resolution of {name}", recording, channel=name, **facts)
-
-
-def unsaturated(
-    recording: Recording, sensors: Mapping[str, Sensor], name: str
-) -> tuple[Array, Array]:
-    """Times and values of a channel's unsaturated samples."""
-    t, y = recording.samples[name]
-    inside = ~sensors[name].saturated(y)
-    return t[inside], y[inside]
-
-
-def against_run(
-    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
-) -> Iterator[Finding]:
-    """Findings on channels whose sign or unit contradicts the run."""
-    for name, (one, signals) in expected.items():
-        (t, y), noise = unsaturated(recording, sensors, name), sensors[name].sd
-        if len(t) < 2 * MOVES:
-            continue
-        p = one.expected(signals, t)[0]
-        measured, run = float(np.std(y)), float(np.std(p))
-        if max(measured, run) < MOVES * noise:
-            continue
-        if measured == 0:
-            yield constant(recording, name, run=run)
-            continue
-        ratio = measured / max(run, 1e-300)
-        if not 1 / LARGER < ratio < LARGER and run > 0:
-            known = [
-                (abs(math.log(ratio / factor)), confusion)
-                for factor, confusion in confusions(recording.units[name])
-            ]
-            distance, confusion = min(known, default=(math.inf, ""))
-            if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
-                more = {"channel": name, "ratio": ratio, "confusion": confusion}
-                yield found("unit", f"unit of {name}", recording, True, **more)
-            else:
-                yield found("size", f"size of {name}", recording, channel=name, ratio=ratio)
-        elif min(measured, run) >= MOVES * noise:
-            alike = float(np.mean((y - y.mean()) * (p - p.mean()))) / (measured * run)
-            if alike < OPPOSITE:
-                more = {"channel": name, "correlation": alike}
-                yield found("sign", f"sign of {name}", recording, True, **more)

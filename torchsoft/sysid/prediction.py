@@ -79,41 +79,53 @@ class Readout:
         """Noiseless reading (k,) at `times`, its derivatives (k, n) by the parameters of the run's
         sensitivities, and those by the nuisances; by no backlash it is the secant to one as large
         as the noise."""
-        t, at, y = signals.t, self.own_times(times), self.quantity(signals, signals.values)
+        y, later = self.quantity(signals, signals.values), times - self.middle
         source, side = taken_up(y, self.backlash)
-        seen = y[source] - 0.5 * self.backlash * side
+        held, slopes = y[source] - 0.5 * self.backlash * side, None
+
+        def curves(columns: Array, lag: float) -> CubicSpline:
+            return CubicSpline(signals.t, lagged(signals.t, columns, lag))
+
+        def behind(columns: Array, lag: float = self.lag) -> Array:
+            return curves(columns, lag)(self.own_times(times))
+
+        rate = curves(held, self.lag)(self.own_times(times), 1)
+        by_lag = -rate
+        if self.lag > 0:
+            less, more = (behind(held, (1 + part) * self.lag) for part in (-LAG_STEP, LAG_STEP))
+            by_lag = (more - less) / (2 * LAG_STEP * self.lag)
+        by: dict[Nuisance, Array] = {
+            kind: self.gain * behind(column)
+            for kind, column in self._by_signals(signals, y, source, side).items()
+        }
+        seen = behind(held)
+        by |= {
+            "gain": seen,
+            "bias": np.ones(len(times)),
+            "drift": later,
+            "delay": -self.gain * rate,
+            "clock": -self.gain * rate * later,
+            "lag": self.gain * by_lag,
+        }
+        if signals.derivatives is not None:
+            slopes = self.gain * behind(self.quantity(signals, signals.derivatives)[source])
+        return self.gain * seen + self.bias + self.drift * later, slopes, by
+
+    def _by_signals(
+        self, signals: Signals, y: Array, source: NDArray[np.intp], side: Array
+    ) -> dict[Nuisance, Array]:
+        """Derivatives (G,) of the quantity y (G,) with backlash by the nuisances that act on the
+        grid."""
         if self.backlash == 0.0:
             other, side = taken_up(y, self.noise)
-            side -= 2 * (y[other] - y) / self.noise
+            side = side - 2 * (y[other] - y) / self.noise
         by: dict[Nuisance, Array] = {"backlash": -0.5 * side}
         for one in self.terms:
             if one.by is not None:
-                (kind, factor), j = one.by, signals.names.index(one.channel)
-                more = factor * slope(t, signals.values[:, j], one.order)[source]
-                by[kind] = by.get(kind, 0.0) + more
-
-        def behind(columns: Array, lag: float = self.lag) -> CubicSpline:
-            return CubicSpline(t, lagged(t, columns, lag))
-
-        curves = behind(np.column_stack((seen, *by.values())))
-        y, *rows = curves(at).T
-        rate, slopes = curves(at, 1)[:, 0], None
-        by = {kind: self.gain * row for kind, row in zip(by, rows)}
-        later = -rate
-        if self.lag > 0:
-            less, more = (behind(seen, (1 + part) * self.lag)(at) for part in (-LAG_STEP, LAG_STEP))
-            later = (more - less) / (2 * LAG_STEP * self.lag)
-        by |= {
-            "gain": y,
-            "bias": np.ones(len(times)),
-            "drift": times - self.middle,
-            "delay": -self.gain * rate,
-            "clock": self.gain * rate * (self.middle - times),
-            "lag": self.gain * later,
-        }
-        if signals.derivatives is not None:
-            slopes = self.gain * behind(self.quantity(signals, signals.derivatives)[source])(at)
-        return self.gain * y + self.bias + self.drift * (times - self.middle), slopes, by
+                kind, factor = one.by
+                values = signals.values[:, signals.names.index(one.channel)]
+                by[kind] = by.get(kind, 0.0) + factor * slope(signals.t, values, one.order)[source]
+        return by
 
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
         """Expected less measured values over the noise (k,), and the derivative by the expected

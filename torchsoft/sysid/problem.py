@@ -12,7 +12,7 @@ from torchsoft.display import Shown, amount, suggestion
 from torchsoft.physics.channels import Touch
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
-from torchsoft.sysid.assumptions import Variation
+from torchsoft.sysid.assumptions import Suspect
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
     FailedRun,
@@ -24,7 +24,7 @@ from torchsoft.sysid.prediction import (
     set_parameters,
 )
 from torchsoft.sysid.recording import Array, Mask, Recording, extended
-from torchsoft.sysid.runs import Job, Runner, Vary
+from torchsoft.sysid.runs import Job, Runner
 from torchsoft.sysid.unknowns import (
     Coordinates,
     Nuisance,
@@ -83,6 +83,29 @@ def with_extensions(
     return added, out
 
 
+def check_sensors(
+    recordings: Sequence[Recording], sensors: Collection[str], sampled: Collection[str]
+) -> None:
+    """Raises `ValueError` for a sensor of no channel, or without samples, and for a recording
+    without samples of any sensor."""
+    touch = [Touch(recording.rig) for recording in recordings]
+    known = dict.fromkeys(c for recording in recordings for c in recording.channels)
+    for channel in sensors:
+        felt = any(channel in one or channel in one.arrays for one in touch)
+        if channel not in known and not felt:
+            raise ValueError(
+                f"sensors: `{line(channel, 80)}` is not a channel; "
+                f"{suggestion(channel, known, 'known:')}"
+            )
+        if channel not in sampled:
+            raise ValueError(f"sensors: no recording has samples of `{channel}`")
+    for recording in recordings:
+        if not set(sensors) & set(recording.samples):
+            raise ValueError(
+                f"recording `{recording.name}` has samples of none of the sensors {list(sensors)}"
+            )
+
+
 def check_ends(
     coordinates: Coordinates, recordings: Sequence[Recording], held: Collection[str]
 ) -> None:
@@ -114,7 +137,7 @@ def check_possible(recording: Recording, values: Mapping[str, float]) -> None:
 
 
 DIFFERENCE = 0.1
-"""Part of the amount of a variation by which its column is differenced."""
+"""Part of the amount of an alternative by which its column is differenced."""
 
 
 class Reading(NamedTuple):
@@ -137,7 +160,7 @@ class Problem(Shown):
 
     `recordings` have distinct names; `sensors` are the channels that count, with their noise;
     `unknowns` are the parameters, `extensions` of the rigs included; `noise` is the colour of a
-    channel's noise, white by default. Amounts of `variations` of the recordings are coordinates
+    channel's noise, white by default. Amounts of `alternatives` to the recordings are coordinates
     too; those whose labels are `held` are not free. Short names are taken here, and the problem and
     its results have the full ones. Raises `ValueError` where these do not fit together.
     """
@@ -148,7 +171,7 @@ class Problem(Shown):
         sensors: dict[str, Sensor],
         unknowns: dict[str, Unknown],
         noise: Mapping[str, Autoregression] | None = None,
-        variations: Sequence[Variation] = (),
+        alternatives: Sequence[Suspect] = (),
         held: Collection[str] = (),
     ) -> None:
         names = [recording.name for recording in recordings]
@@ -157,33 +180,15 @@ class Problem(Shown):
         sensors, unknowns = by_channel(rigs, sensors, sampled), by_parameter(rigs, unknowns)
         if not recordings or len(set(names)) < len(names):
             raise ValueError(f"recordings need names of their own, but are called {names}")
-        for channel in sensors:
-            touch = [Touch(recording.rig) for recording in recordings]
-            if not any(
-                channel in recording.channels or channel in one or channel in one.arrays
-                for recording, one in zip(recordings, touch)
-            ):
-                known = dict.fromkeys(c for recording in recordings for c in recording.channels)
-                raise ValueError(
-                    f"sensors: `{line(channel, 80)}` is not a channel; "
-                    f"{suggestion(channel, known, 'known:')}"
-                )
-            if channel not in sampled:
-                raise ValueError(f"sensors: no recording has samples of `{channel}`")
-        for recording in recordings:
-            if not set(sensors) & set(recording.samples):
-                raise ValueError(
-                    f"recording `{recording.name}` has samples of none of the sensors "
-                    f"{list(sensors)}"
-                )
+        check_sensors(recordings, sensors, sampled)
         recordings, unknowns = with_extensions(recordings, unknowns)
         unknowns = {
             name: u.model_copy(update={"fixed": True}) if name in held else u
             for name, u in unknowns.items()
         }
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
-        self.variations, self.held = {one.name: one for one in variations}, frozenset(held)
-        amounts = {one.name: one.bounds for one in variations}
+        self.alternatives, self.held = {one.name: one for one in alternatives}, frozenset(held)
+        amounts = {one.name: one.bounds for one in alternatives}
         self.coordinates = Coordinates(unknowns, sensors, recordings, amounts, held)
         if not self.coordinates.free.any():
             raise ValueError("there is nothing to identify: no unknown is free")
@@ -216,18 +221,32 @@ class Problem(Shown):
             self.sensors,
             self.unknowns,
             noise,
-            [*self.variations.values()],
+            [*self.alternatives.values()],
             self.held,
         )
 
-    @property
-    def varying(self) -> dict[str, Vary]:
-        """What its jobs' runner needs to know: the variations of runs, by name."""
-        return {name: one.vary for name, one in self.variations.items() if one.vary is not None}
-
     def runner(self, like: Runner) -> Runner:
         """A runner for this problem, with the threads and the folder of another."""
-        return like.of(self.recordings, self.varying)
+        changes = {name: one.change for name, one in self.alternatives.items() if one.change}
+        return like.of(self.recordings, changes)
+
+    def amounts(self, x: Array) -> tuple[tuple[str, float], ...]:
+        """Amounts [SI] of the alternatives at x (n,), by name, where they are not zero."""
+        pairs = [
+            (c.name, c.to_value(x[i]))
+            for i, c in enumerate(self.coordinates.all)
+            if c.kind == "alternative"
+        ]
+        return tuple((name, amount) for name, amount in pairs if amount != 0.0)
+
+    def samples_at(self, x: Array, k: int) -> dict[str, tuple[Array, Array]]:
+        """Samples of recording k, under the alternatives at x (n,)."""
+        recording = self.recordings[k]
+        for name, size in self.amounts(x):
+            one = self.alternatives[name]
+            if one.of_samples and one.change is not None:
+                recording = one.change(recording, size) or recording
+        return recording.samples
 
     def whitened(self, recording: Recording, channel: str, rows: Array) -> Array:
         """Rows (k,) or (k, n) of a channel's samples, whitened."""
@@ -292,12 +311,7 @@ class Problem(Shown):
     ) -> list[Job]:
         """One run for each recording; with `free`, differentiated by the parameters that depend on
         free coordinates (n,)."""
-        c, out, varying = self.coordinates, [], self.varying
-        varied = tuple(
-            (one.name, amount)
-            for i, one in enumerate(c.all)
-            if one.name in varying and (amount := one.to_value(x[i])) != 0.0
-        )
+        c, out, changes = self.coordinates, [], self.amounts(x)
         for k, recording in enumerate(self.recordings):
             if recording.name not in which:
                 continue
@@ -306,7 +320,7 @@ class Problem(Shown):
                 moved = (c.jacobian(x, recording.name, values)[:, free] != 0).any(1)
                 names = tuple(name for name, moves in zip(c.names, moved) if moves)
             mine = steps[recording.name] if isinstance(steps, Mapping) else steps
-            out.append(Job(k, values, names, mine, self.interpolated, varied))
+            out.append(Job(k, values, names, mine, self.interpolated, changes))
         return out
 
     def residuals(
@@ -320,35 +334,28 @@ class Problem(Shown):
         """Residuals of some recordings at x (n,), with the Jacobian's columns of `free`
         coordinates, and the steps of their runs, on which residuals are smooth in x.
 
-        Columns of variations are differences: a run with another amount, or the same run read in
-        another way. Runs of varied recordings choose steps of their own, so that those of the last
-        are taken by all.
+        Columns of alternatives are differences of two runs. Runs of changed recordings choose their
+        own steps, and both runs take those of the first.
         """
         jobs = self.jobs(x, which, steps, free)
-        if not isinstance(steps, Mapping) and any(job.varied for job in jobs):
+        if not isinstance(steps, Mapping) and self.amounts(x):
             plain = self.jobs(x, which, steps, None)
             first = self.gather(x, plain, runner.run(plain))
             if first.failed:
                 return first
             jobs = self.jobs(x, which, first.steps, free)
-        runs = runner.run(jobs)
-        at = self.gather(x, jobs, runs)
+        at = self.gather(x, jobs, runner.run(jobs))
         if free is None or at.failed:
             return at
         for i in np.flatnonzero(free):
             one = self.coordinates.all[i]
-            if one.kind != "variation":
-                continue
-            step = DIFFERENCE * self.variations[one.name].amount / (one.high - one.low)
-            moved = x + step * np.eye(len(x))[i]
-            others, rerun = jobs, runs
-            if self.variations[one.name].vary is not None:
-                others = self.jobs(moved, which, at.steps, None)
-                rerun = runner.run(others)
-            there = self.gather(moved, others, rerun)
-            if there.failed:
-                return there._replace(J=np.full_like(at.J, np.inf))
-            at.J[:, i] = (there.r - at.r) / step
+            if one.kind == "alternative":
+                step = DIFFERENCE * self.alternatives[one.name].step / (one.high - one.low)
+                moved = x + step * np.eye(len(x))[i]
+                there = self.residuals(runner, moved, which, at.steps)
+                if there.failed:
+                    return there._replace(J=np.full_like(at.J, np.inf))
+                at.J[:, i] = (there.r - at.r) / step
         return at
 
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
@@ -392,18 +399,10 @@ class Problem(Shown):
 
     def readings(self, x: Array, job: Job, run: Prediction) -> Iterator[Reading]:
         """Readings of the sensors in a job's recording at x (n,)."""
-        recording = self.recordings[job.recording]
+        recording, samples = self.recordings[job.recording], self.samples_at(x, job.recording)
         signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
-        amounts = [
-            (one.read, c.to_value(x[i]))
-            for i, c in enumerate(self.coordinates.all)
-            if (one := self.variations.get(c.name)) is not None and one.read is not None
-        ]
         for channel, one in self.readouts(x, job.recording).items():
-            t, measured = recording.samples[channel]
-            for read, size in amounts:
-                if size != 0.0:
-                    measured = measured + read(recording, channel, size)
+            t, measured = samples[channel]
             y, slopes, by = one.expected(signals, t)
             yield Reading(channel, t, measured, y, slopes, by, *one.residuals(y, measured))
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -17,6 +17,7 @@ from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.result import IdentificationResult
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sentences import Finding
 
 CHOSEN_ANEW = 1.0
 """Largest acceptable change of |r|^2 by steps that are chosen anew, in place of those of the
@@ -75,10 +76,6 @@ FITTED = 2e-3
 LOWER = 0.1
 """Fall of |r|^2 below the optimum's that shows that the fit was not at its optimum."""
 
-DIFFERENT = 0.2
-"""Difference between the ends of both intervals, over the half width of Wald's, that gets a
-notice."""
-
 
 @dataclass(frozen=True)
 class Profile:
@@ -86,7 +83,7 @@ class Profile:
     (-log posterior) at them.
 
     `others` holds the values of the other coordinates by label, in physical units. `ci95` has None
-    for an end that was not found, and `notices` the reason; `wald95` is the interval by the
+    for an end that was not found, and `findings` the reason; `wald95` is the interval by the
     covariance. `variance` is the divisor of the rises, above one where residuals are larger than
     the stated noise.
     """
@@ -99,7 +96,7 @@ class Profile:
     ci95: tuple[float | None, float | None]
     wald95: tuple[float, float]
     variance: float
-    notices: list[str]
+    findings: list[Finding]
 
 
 class Point(NamedTuple):
@@ -110,12 +107,9 @@ class Point(NamedTuple):
     at: Residuals
 
 
-class Side(NamedTuple):
-    """The points on one side of the optimum, outwards, the reason of an early end, and notices."""
-
-    points: list[Point]
-    ended: str
-    notices: list[str]
+Side = tuple[list[Point], str]
+"""The optimum and the points on one side of it, outwards, and why they end before the interval
+does."""
 
 
 def profiles(
@@ -126,27 +120,19 @@ def profiles(
 
     Raises `ValueError` for a label that is not a free coordinate's.
     """
-    known = optimum.labels
-    for label in labels or ():
-        if label not in known:
+    chosen, every = list(optimum.labels if labels is None else labels), optimum.labels
+    for label in chosen:
+        if label not in every:
             raise ValueError(
                 f"there is no free coordinate {label!r} to profile; "
-                f"{suggestion(label, known, 'there are')}"
+                f"{suggestion(label, every, 'there are')}"
             )
-    chosen = list(known if labels is None else labels)
-    where = {label: i for i, label in enumerate(optimum.problem.coordinates.labels)}
-    tasks = [(label, sign) for label in chosen for sign in (-1, 1)]
+    where = [optimum.problem.coordinates.labels.index(label) for label in chosen]
+    tasks = [(i, sign) for i in where for sign in (-1, 1)]
     with single_threaded():
-        work = parallel_map(
-            lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]),
-            len(tasks),
-            optimum.runner.workers,
-        )
+        work = parallel_map(lambda k: walk(optimum, *tasks[k]), len(tasks), optimum.runner.workers)
         done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=hidden(progress)))
-    return [
-        assemble(optimum, where[label], done[2 * k], done[2 * k + 1])
-        for k, label in enumerate(chosen)
-    ]
+    return [assemble(optimum, i, done[2 * k], done[2 * k + 1]) for k, i in enumerate(where)]
 
 
 def sd(o: Fit, i: int) -> float:
@@ -156,45 +142,31 @@ def sd(o: Fit, i: int) -> float:
 
 def walk(o: Fit, i: int, sign: int) -> Side:
     """One side of the profile of coordinate i, from the optimum to the end of the interval."""
-    label, (low, high) = (
-        o.problem.coordinates.labels[i],
-        (float(b[i]) for b in o.problem.coordinates.bounds),
-    )
-    edge = high if sign > 0 else low
-    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * sd(o, i), (high - low) / 8)
-    points, notices, shorter = list[Point](), list[str](), 0
-    while here.rise < RISE and len(points) < POINTS:
-        if sign * (edge - here.x[i]) <= 1e-9 * (high - low):
-            return Side(
-                points, f"{label} may not be {'larger' if sign > 0 else 'smaller'}", notices
-            )
-        length = min(stride, sign * (edge - here.x[i]))
+    c = o.problem.coordinates.all[i]
+    low, high = (float(bound[i]) for bound in o.problem.coordinates.bounds)
+    points, shorter = [Point(o.x, 0.0, o.at)], 0
+    stride = min(STRIDE * sd(o, i), (high - low) / 8)
+    while (here := points[-1]).rise < RISE:
+        left = (high - here.x[i]) if sign > 0 else (here.x[i] - low)
+        if left <= 1e-9 * (high - low):
+            return points, f"{c.label} may not be {'larger' if sign > 0 else 'smaller'}"
+        if len(points) > POINTS:
+            return points, f"after {POINTS} points the rise is still {here.rise:.2g}"
+        length = min(stride, left)
         there, reason = refit(o, i, here, here.x[i] + sign * length)
         if there is None and shorter == SHORTER:
-            return Side(points, reason, notices)
+            return points, reason
         gained = 0.0 if there is None else max(there.rise, 0.0) ** 0.5 - max(here.rise, 0.0) ** 0.5
+        grow = STRIDE / max(gained, 1e-9)
         if there is None or (there.rise > BEYOND and shorter < SHORTER):
-            stride, shorter = (
-                length * float(np.clip(STRIDE / max(gained, 1e-9), 0.1, 0.5)),
-                shorter + 1,
-            )
+            stride, shorter = length * float(np.clip(grow, 0.1, 0.5)), shorter + 1
             continue
+        if (less := -there.rise * o.variance) > LOWER:
+            at = f"{c.label} = {c.to_value(there.x[i]):.4g}"
+            return points, f"the fit did not end at the optimum, at {at} |r|^2 is {less:.2g} less"
         points.append(there)
-        if there.rise * o.variance < -LOWER:
-            value = o.problem.coordinates.all[i].to_value(there.x[i])
-            notices.append(
-                f"the fit did not end at the optimum: with {label} = {value:.4g} the misfit |r|^2 "
-                f"is less by {-there.rise * o.variance:.2g}; fit again from there"
-            )
-            return Side(points, "the fit did not end at the optimum", notices)
-        if there.rise < here.rise - LOWER:
-            notices.append(f"the profile of {label} is not monotone: there may be another optimum")
-        stride, here = length * float(np.clip(STRIDE / max(gained, 1e-9), 0.3, 3.0)), there
-    return Side(
-        points,
-        "" if here.rise >= RISE else f"after {POINTS} points the rise is still {here.rise:.2g}",
-        notices,
-    )
+        stride = length * float(np.clip(grow, 0.3, 3.0))
+    return points, ""
 
 
 def refit(o: Fit, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
@@ -221,54 +193,43 @@ def refit(o: Fit, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
     return Point(x, (float(at.r @ at.r) - o.square) / o.variance, at), ""
 
 
+def interval_end(
+    o: Fit, i: int, side: Side, curve: tuple[Array, Array], sign: int
+) -> tuple[float | None, list[Finding]]:
+    """One end of the interval in physical units, by the `curve` of x and the signed square root
+    of the rise, with a finding where it was not found or is uncertain."""
+    one, (points, reason) = o.problem.coordinates.all[i], side
+    facts: dict[str, Any] = {"estimate": one.label, "end": "upper" if sign > 0 else "lower"}
+    if reason:
+        facts |= {"value": one.to_value(points[-1].x[i]), "reason": reason}
+        return None, [Finding("profile-open", "note", facts)]
+    low, high = sorted((points[-1].x[i], points[-2].x[i]))
+    roots = PchipInterpolator(*curve).solve(sign * RISE**0.5)
+    end = one.to_value(float(roots[(roots >= low) & (roots <= high)][0]))
+    change = o.step_effect(points[-1].x)
+    if abs(change) < CHOSEN_ANEW * o.variance:
+        return end, []
+    return end, [Finding("profile-steps", "note", facts | {"change": change, "rtol": o.rtol})]
+
+
 def assemble(o: Fit, i: int, below: Side, above: Side) -> Profile:
-    """The profile of both sides, with its interval and notices."""
-    c = o.problem.coordinates
-    one, points = c.all[i], [*below.points[::-1], Point(o.x, 0.0, o.at), *above.points]
+    """The profile of both sides, with its interval and findings."""
+    c, one = o.problem.coordinates, o.problem.coordinates.all[i]
+    points, half = [*below[0][:0:-1], *above[0]], RISE**0.5 * sd(o, i)
     x = np.array([point.x[i] for point in points])
-    zeta = np.sign(x - o.x[i]) * np.sqrt(np.maximum([point.rise for point in points], 0.0))
-    ends, notices = list[float | None](), [*below.notices, *above.notices]
-    for side, sign, name in ((below, -1, "lower"), (above, 1, "upper")):
-        if side.ended or not side.points:
-            last = one.to_value(side.points[-1].x[i] if side.points else o.x[i])
-            notices.append(
-                f"{one.label} has no {name} bound of its 95 % interval within {last:.4g}: "
-                f"{side.ended}"
-            )
-            ends.append(None)
-            continue
-        a, b = sorted(
-            (side.points[-1].x[i], side.points[-2].x[i] if len(side.points) > 1 else o.x[i])
-        )
-        roots = PchipInterpolator(x, zeta).solve(sign * RISE**0.5)
-        ends.append(float(roots[(roots >= a) & (roots <= b)][0]))
-        off = o.step_effect(side.points[-1].x)
-        if not abs(off) < CHOSEN_ANEW * o.variance:
-            notices.append(
-                f"the {name} end of the profile of {one.label} is uncertain: steps chosen anew "
-                f"there change |r|^2 by {off:.2g}; take a tighter tolerance than rtol = {o.rtol:g}"
-            )
-    half = RISE**0.5 * sd(o, i)
-    wald = o.x[i] - half, o.x[i] + half
-    worst = max((abs(e - w) / half for e, w in zip(ends, wald) if e is not None), default=0.0)
-    physical = [None if e is None else one.to_value(e) for e in ends]
-    straight = one.to_value(max(wald[0], -700.0)), one.to_value(min(wald[1], 700.0))
-    if worst > DIFFERENT:
-        bounds = [f"{e:.4g}" if e is not None else "open" for e in physical]
-        notices.append(
-            f"the misfit is no parabola in {one.label}: its profile's interval is {bounds[0]} .. "
-            f"{bounds[1]}, the covariance's {straight[0]:.4g} .. {straight[1]:.4g}; take the "
-            "profile's"
-        )
-    every = [k for k in np.flatnonzero(o.free) if k != i]
+    rises = np.maximum([point.rise for point in points], 0.0)
+    curve = x, np.sign(x - o.x[i]) * np.sqrt(rises)
+    lower, found = interval_end(o, i, below, curve, -1)
+    upper, more = interval_end(o, i, above, curve, 1)
+    others = [k for k in np.flatnonzero(o.free) if k != i]
     return Profile(
         one.label,
         one.to_value(o.x[i]),
         [one.to_value(v) for v in x],
-        [max(float(point.rise), 0.0) for point in points],
-        {c.labels[k]: [c.all[k].to_value(point.x[k]) for point in points] for k in every},
-        (physical[0], physical[1]),
-        straight,
+        rises.tolist(),
+        {c.labels[k]: [c.all[k].to_value(point.x[k]) for point in points] for k in others},
+        (lower, upper),
+        (one.to_value(max(o.x[i] - half, -700.0)), one.to_value(min(o.x[i] + half, 700.0))),
         o.variance,
-        list(dict.fromkeys(notices)),
+        found + more,
     )

@@ -2,7 +2,7 @@
 gaps."""
 
 import inspect
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -61,16 +61,14 @@ class Recording:
     `rig` has the known parameters, nominal values of the unknown ones, the laws, and the reference
     that the run followed; runs use copies of it. `samples` holds times (k,) [s] and values (k,) by
     channel, each with its own times; channels are those of `measurable`, and those of touch.
-    `start` is the start of the run. Parameters in `tied` follow from runs, with their derivatives
-    (n,) with respect to the parameters of a run. `dataclasses.replace` makes variants, such as one
-    with another law.
+    `start` is the start of the run. `dataclasses.replace` makes variants, such as one with another
+    law.
     """
 
     name: str
     rig: Rig = field(repr=False)
     samples: dict[str, tuple[Array, Array]] = field(repr=False)
     start: Start
-    tied: Mapping[str, Array] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if not self.samples:

@@ -17,8 +17,7 @@ p-values are adjusted by Holm's method: with a right model, the probability that
 although intervals allow for it: it may come from a sensor, or from a wrong model.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
 
@@ -43,12 +42,16 @@ prediction always counts."""
 FEWEST = 4
 """Fewest remaining samples of a saturated sensor for a test."""
 
+FAINT = 0.5
+"""Residuals over the noise below which their pattern is not tested, since the noise is
+overstated."""
+
 
 class Part(NamedTuple):
     """Residuals of one channel in one recording, without samples changed by saturation: times t
     (m,) [s], their rows (m,) in r and J, the residuals `raw` (m,) over the stated noise, the
-    predicted `reading` (m,) [unit], the estimated noise (None for white noise as stated), the
-    whitening of (m,) or (m, k), and the number of `saturated` samples."""
+    predicted `reading` (m,) [unit], the estimated noise (None for white noise as stated), and the
+    number of `saturated` samples."""
 
     recording: str
     channel: str
@@ -57,8 +60,12 @@ class Part(NamedTuple):
     raw: Array
     reading: Array
     noise: Autoregression | None = None
-    whitened: Callable[[Array], Array] = lambda rows: rows
     saturated: int = 0
+
+    @property
+    def faint(self) -> bool:
+        """Whether the residuals are far smaller than the stated noise."""
+        return float(np.mean(self.raw**2)) < FAINT**2
 
     def result(self, test: "Test", p: float, size: float, **facts: Any) -> "ResidualTest":
         """The result of a test of this part."""
@@ -88,8 +95,7 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
             if kept.sum() < FEWEST:
                 continue
             t, rows, raw, reading = t[kept], rows[kept], raw[kept], reading[kept]
-        whitened = partial(problem.whitened, recording, channel)
-        out.append(Part(recording.name, channel, t, rows, raw, reading, noise, whitened, saturated))
+        out.append(Part(recording.name, channel, t, rows, raw, reading, noise, saturated))
     return out
 
 
@@ -117,10 +123,6 @@ TESTED = 10
 """Most autocorrelations in a test, and at most one in twenty samples: the sum of more is not yet
 chi-squared in its tail, where alarms are."""
 
-FAINT = 0.5
-"""Residuals over the noise below which their pattern is not tested, since the noise is
-overstated."""
-
 MEDIAN = 0.37
 """Efficiency of the level by the median residual, relative to the mean square."""
 
@@ -128,6 +130,9 @@ SUDDEN, BEFORE, BEYOND = 3.0, 2.0, 5.0
 """Least ratio of rms residuals after a time to those before it at which a misfit begins there,
 largest rms residual before it, and the residual that shows it first, which one sample in a million
 exceeds by chance; over the noise."""
+
+TINY = 1e-300
+"""What keeps quotients and logarithms of noise-free residuals finite."""
 
 Test = Literal["level", "white", "motion", "channels", "onset", "outliers", "priors"]
 
@@ -165,13 +170,8 @@ class ResidualTest(NamedTuple):
 def systematic(tests: Sequence[ResidualTest]) -> list[ResidualTest]:
     """The alarms that a wrong model causes, the clearest first: residuals that are too large,
     coloured, follow the motion, or belong together."""
-    kinds = ("white", "motion", "channels")
-    found = [
-        one
-        for one in tests
-        if one.alarming and (one.test in kinds or (one.test == "level" and one.size > 1))
-    ]
-    return sorted(found, key=lambda one: one.p)
+    kinds = ("larger", "white", "motion", "channels")
+    return sorted((t for t in tests if t.alarming and t.code in kinds), key=lambda one: one.p)
 
 
 def judge_residuals(
@@ -184,34 +184,20 @@ def judge_residuals(
     are not tested.
     """
     Q, R = np.linalg.qr(J)
-    seen = np.abs(np.diag(R)) > 1e-9 * max(np.abs(np.diag(R)).max(initial=0.0), 1e-300)
-    Q, out = Q[:, seen], list[ResidualTest]()
-    sums = [level(part, r, Q, robust) for part in parts]
-    out += [test for test, _, _ in sums]
-    exact = [(square, dof) for part, (_, square, dof) in zip(parts, sums) if part.noise is None]
-    if len(exact) > 1:
-        square, dof = (float(sum(some)) for some in zip(*exact))
-        p, size = two_sided(square, dof), (square / dof) ** 0.5
-        out.append(ResidualTest("level", None, None, p, size, {"samples": dof}))
-    recordings = {
-        one: [part for part in parts if part.recording == one]
-        for one in dict.fromkeys(part.recording for part in parts)
-    }
-    onsets = {one: found for one, mine in recordings.items() if (found := onset(mine))}
-    out += onsets.values()
-    for part in parts:
-        if float(np.mean(part.raw**2)) < FAINT**2:
-            continue
-        out.append(white(part, r))
-        out += lines_up(part, [p for p in parts if p.recording == part.recording], r, Q)
-        if not robust and part.recording not in onsets:  # what follows are no outliers
-            out.append(outliers(part, r))
-    for recording, mine in recordings.items():
-        out += together(recording, mine, r, Q)
-    out += [
-        contradicted(name, r[k], Q[k])
-        for name, k in zip(priors, range(len(r) - len(priors), len(r)))
-    ]
+    size = np.abs(np.diag(R))
+    Q = Q[:, size > 1e-9 * max(size.max(initial=0.0), TINY)]
+    out = levels(parts, r, Q, robust)
+    for recording in dict.fromkeys(part.recording for part in parts):
+        mine = [part for part in parts if part.recording == recording]
+        started = onset(mine)
+        out += started
+        for part in (part for part in mine if not part.faint):
+            out += [white(part, r), *follow_motion(part, mine, r, Q)]
+            if not robust and not started:  # what follows are no outliers
+                out.append(outliers(part, r))
+        out += correlated_channels(recording, mine, r, Q)
+    first = len(r) - len(priors)
+    out += [contradicted(name, r[first + k], Q[first + k]) for k, name in enumerate(priors)]
     return holm(out)
 
 
@@ -229,39 +215,43 @@ def two_sided(square: float, dof: float) -> float:
     return float(min(1.0, 2 * min(stats.chi2.sf(square, dof), stats.chi2.cdf(square, dof))))
 
 
-def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[ResidualTest, float, float]:
-    """Test of the sum of squares against the stated noise; returns also that sum and its degrees of
-    freedom.
+def levels(parts: Sequence[Part], r: Array, Q: Array, robust: bool) -> list[ResidualTest]:
+    """Tests of sums of squares against the stated noise: of every part, and of all together whose
+    noise was not estimated.
 
     Where the noise's level was estimated from these residuals, the raw ones are tested, which are
     worth `Autoregression.effective` samples (Satterthwaite).
     """
-    rows = r[part.rows] if part.noise is None else part.raw
-    n = len(rows)
-    free = max(1.0 - float(np.sum(Q[part.rows] ** 2)) / n, 1 / n)  # what the fit left of them
-    mean, worth = float(rows @ rows) / n, float(n)
-    if robust:
-        mean, worth = (
-            (float(np.median(np.abs(rows))) / float(stats.norm.ppf(0.75))) ** 2,
-            MEDIAN * n,
-        )
-    if part.noise is not None:
-        worth *= part.noise.effective(n) / n
-    dof = worth * free
-    square, size = mean * worth, float((mean / free) ** 0.5)
-    return part.result("level", two_sided(square, dof), size), square, dof
+    out, squares, dofs = list[ResidualTest](), list[float](), list[float]()
+    for part in parts:
+        rows = r[part.rows] if part.noise is None else part.raw
+        n = len(rows)
+        free = max(1.0 - float(np.sum(Q[part.rows] ** 2)) / n, 1 / n)  # what the fit left of them
+        mean, worth = float(rows @ rows) / n, float(n)
+        if robust:
+            mean = (float(np.median(np.abs(rows))) / float(stats.norm.ppf(0.75))) ** 2
+            worth = MEDIAN * n
+        if part.noise is not None:
+            worth *= part.noise.effective(n) / n
+        dof = worth * free
+        out.append(part.result("level", two_sided(mean * worth, dof), float((mean / free) ** 0.5)))
+        if part.noise is None:
+            squares.append(mean * worth)
+            dofs.append(dof)
+    if len(dofs) > 1:
+        square, dof = sum(squares), sum(dofs)
+        facts = {"samples": dof}
+        p = two_sided(square, dof)
+        out.append(ResidualTest("level", None, None, p, (square / dof) ** 0.5, facts))
+    return out
 
 
 def autocorrelation(r: Array) -> Array:
     """Autocorrelation of residuals r (m,) at lags 1, 2, ..., up to `LAGS` and a quarter of the
     samples."""
     c = r - r.mean()
-    lags, power = min(LAGS, len(r) // 4), float(c @ c)
-    return (
-        np.array([c[k:] @ c[:-k] / power for k in range(1, lags + 1)])
-        if power > 0
-        else np.zeros(lags)
-    )
+    power = max(float(c @ c), TINY)
+    return np.array([c[k:] @ c[:-k] / power for k in range(1, min(LAGS, len(r) // 4) + 1)])
 
 
 def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
@@ -285,9 +275,9 @@ def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, A
     """F test of residuals against Z (m, k), signals at the samples of a part: the p-value of
     fitting them besides the unknowns, relative to the variance of the part, the share of that
     variance that they explain, and the signed effect of each alone (k,)."""
-    size = np.linalg.norm(Z, axis=0)
-    columns = np.zeros((len(r), Z.shape[1]))
-    columns[part.rows] = part.whitened(Z / np.where(size > 0, size, 1.0))
+    size, columns = np.linalg.norm(Z, axis=0), np.zeros((len(r), Z.shape[1]))
+    Z = Z / np.where(size > 0, size, 1.0)
+    columns[part.rows] = Z if part.noise is None else part.noise.whitener(part.t) @ Z
     before = np.linalg.norm(columns, axis=0)
     columns -= Q @ (Q.T @ columns)  # what the unknowns could not have explained themselves
     after = np.linalg.norm(columns, axis=0)
@@ -295,17 +285,16 @@ def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, A
     unit = columns[:, new] / after[new]
     U, s, _ = np.linalg.svd(unit, full_matrices=False)
     U, own = U[:, s > 1e-3], float(np.sum(r[part.rows] ** 2))
-    k, taken = U.shape[1], float(np.sum((U.T @ r) ** 2))
+    k, taken, alone = U.shape[1], float(np.sum((U.T @ r) ** 2)), np.zeros(Z.shape[1])
     left = len(part.t) - float(np.sum(Q[part.rows] ** 2)) - k
     if k == 0 or left < 1:
-        return 1.0, 0.0, np.zeros(Z.shape[1])
-    alone = np.zeros(Z.shape[1])
+        return 1.0, 0.0, alone
     alone[new] = unit.T @ r
-    p = float(stats.f.sf((taken / k) / max((own - taken) / left, 1e-300), k, left))
-    return p, min(taken / max(own, 1e-300), 1.0), alone
+    p = float(stats.f.sf((taken / k) / max((own - taken) / left, TINY), k, left))
+    return p, min(taken / max(own, TINY), 1.0), alone
 
 
-def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[ResidualTest]:
+def follow_motion(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[ResidualTest]:
     """Tests of correlation with the predicted reading, as a wrong sensor would cause it, and with
     other channels and their rates, as a wrong law would."""
     out, t = [], part.t
@@ -317,89 +306,76 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Res
         "its rate, as a delay would be": y(t, 1),
         "its acceleration": y(t, 2),
     }
-    others = {}
-    for other in beside:
-        if (
-            other.channel != part.channel
-            and other.t[0] <= t[0] + 0.05
-            and other.t[-1] >= t[-1] - 0.05
-        ):
-            s = CubicSpline(other.t, other.reading)
-            others |= {other.channel: s(t), f"the rate of {other.channel}": s(t, 1)}
-            others |= {f"the acceleration of {other.channel}": s(t, 2)}
+    others = dict[str, Array]()
+    for one in beside:
+        covers = one.t[0] <= t[0] + 0.05 and one.t[-1] >= t[-1] - 0.05
+        if one.channel != part.channel and covers:
+            s = CubicSpline(one.t, one.reading)
+            for order, of in enumerate(("", "the rate of ", "the acceleration of ")):
+                others[f"{of}{one.channel}"] = s(t, order)
     for signals in (own, others):
-        if len(t) < 4 * len(signals) or not signals:
-            continue
-        p, share, alone = explained(part, np.stack(list(signals.values()), 1), r, Q)
-        best = list(signals)[int(np.argmax(np.abs(alone)))]
-        out.append(part.result("motion", p, share, like=best))
+        if signals and len(t) >= 4 * len(signals):
+            p, share, alone = explained(part, np.stack([*signals.values()], 1), r, Q)
+            like = [*signals][int(np.argmax(np.abs(alone)))]
+            out.append(part.result("motion", p, share, like=like))
     return out
 
 
-class Change(NamedTuple):
-    """The largest change of one channel's residuals in time: p-value, time [s], and the rms
-    residuals before and after it, over the noise."""
-
-    p: float
-    time: float
-    before: float
-    after: float
-    channel: str
-
-
-def largest_change(part: Part) -> Change:
+def largest_change(part: Part) -> ResidualTest:
     """The change of the variance of the raw residuals with the largest likelihood, with at least
     `LAGS` samples on either side, tested by ranks, so that single outliers do not count."""
     m, squares, size = len(part.raw), np.cumsum(part.raw**2), np.abs(part.raw)
     if m < 2 * LAGS:
-        return Change(1.0, np.nan, np.nan, np.nan, part.channel)
+        return part.result("onset", 1.0, 0.0)
     k = np.arange(LAGS, m - LAGS + 1)
     before, after = squares[k - 1] / k, (squares[-1] - squares[k - 1]) / (m - k)
-    least = 1e-300  # of noise-free residuals
-    i = int(np.argmin(k * np.log(before + least) + (m - k) * np.log(after + least)))
+    i = int(np.argmin(k * np.log(before + TINY) + (m - k) * np.log(after + TINY)))
     rank = stats.mannwhitneyu(size[: k[i]], size[k[i] :], alternative="less")
-    p, low, high = len(k) * float(rank.pvalue), float(before[i]) ** 0.5, float(after[i]) ** 0.5
-    return Change(min(1.0, p), float(part.t[k[i]]), low, high, part.channel)
+    facts = {"time": float(part.t[k[i]]), "before": float(before[i]) ** 0.5}
+    p = min(1.0, len(k) * float(rank.pvalue))
+    return part.result("onset", p, float(after[i]) ** 0.5, **facts)
 
 
-def onset(mine: Sequence[Part]) -> ResidualTest | None:
-    """Test of a misfit that begins at a certain time, of the parts of one recording. It begins with
-    the first residual beyond `BEYOND` in any channel that fits until then."""
+def onset(mine: Sequence[Part]) -> list[ResidualTest]:
+    """Test of a misfit that begins at a certain time, of the parts of one recording; empty where
+    none does. It begins with the first residual beyond `BEYOND` in any channel that fits until
+    then."""
     changes = [
         one
         for one in map(largest_change, mine)
-        if one.p < LEVEL and one.before < BEFORE and one.after > SUDDEN * max(one.before, 1.0)
+        if one.p < LEVEL
+        and one.facts["before"] < BEFORE
+        and one.size > SUDDEN * max(one.facts["before"], 1.0)
     ]
     if not changes:
-        return None
-    clear, recording = min(changes), mine[0].recording
-    first = [(clear.time, clear.channel, clear.after)]
+        return []
+    clear = min(changes, key=lambda one: (one.p, one.facts["time"]))
+    first = [(clear.facts["time"], clear.channel or "", clear.size)]
     for part in mine:
         for i in np.flatnonzero(np.abs(part.raw) > BEYOND)[:1]:
             if np.sum(part.raw[:i] ** 2) < BEFORE**2 * i:
                 first.append((float(part.t[i]), part.channel, float(np.abs(part.raw[i]))))
     time, channel, size = min(first)
-    facts = {"time": time, "first": channel, "off": size, "before": clear.before}
-    return ResidualTest("onset", recording, clear.channel, clear.p, clear.after, facts)
+    facts = {"time": time, "first": channel, "off": size}
+    return [clear._replace(facts={**clear.facts, **facts})]
 
 
 def outliers(part: Part, r: Array) -> ResidualTest:
     """Test of heavy tails (Anscombe and Glynn)."""
     rows = r[part.rows]
-    m, at = len(rows), int(np.argmax(np.abs(rows)))
-    if m < LAGS or np.ptp(rows) == 0:
+    if len(rows) < LAGS or np.ptp(rows) == 0:
         return part.result("outliers", 1.0, 0.0)
+    at = int(np.argmax(np.abs(rows)))
     tails = float(stats.kurtosistest(rows, alternative="greater").pvalue)
-    largest = abs(float(rows[at]))
-    return part.result("outliers", tails, largest, time=float(part.t[at]))
+    return part.result("outliers", tails, abs(float(rows[at])), time=float(part.t[at]))
 
 
-def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[ResidualTest]:
+def correlated_channels(
+    recording: str, parts: Sequence[Part], r: Array, Q: Array
+) -> list[ResidualTest]:
     """Test of correlation between channels sampled at the same times (Bartlett)."""
     longest = max((p.t for p in parts), key=len)
-    alike = [
-        p for p in parts if np.array_equal(p.t, longest) and float(np.mean(p.raw**2)) >= FAINT**2
-    ]
+    alike = [p for p in parts if np.array_equal(p.t, longest) and not p.faint]
     k = len(alike)
     if k < 2:
         return []
@@ -407,7 +383,7 @@ def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[
     n = rows.shape[1] - sum(float(np.sum(Q[p.rows] ** 2)) for p in alike) / k
     if n < 4 * k or (rows.std(1) == 0).any():
         return []
-    C = np.atleast_2d(np.corrcoef(rows))
+    C = np.corrcoef(rows)
     square = -(n - 1 - (2 * k + 5) / 6) * float(np.linalg.slogdet(C)[1])
     i, j = np.unravel_index(int(np.argmax(np.abs(np.triu(C, 1)))), C.shape)
     facts = {"channels": f"{alike[i].channel} and {alike[j].channel}"}
@@ -418,9 +394,8 @@ def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[
 def contradicted(name: str, r: float, q: Array) -> ResidualTest:
     """Test of the residual r of a prior, whose row of Q is q (n,)."""
     free = max(1.0 - float(q @ q), 0.0)
-    z = float(r) / free**0.5 if free > 1e-9 else 0.0  # without data it is where the prior is
-    p = 2 * float(stats.norm.sf(abs(z)))
-    return ResidualTest("priors", None, None, p, abs(z), {"prior": name})
+    z = abs(float(r)) / free**0.5 if free > 1e-9 else 0.0  # without data it is where the prior is
+    return ResidualTest("priors", None, None, 2 * float(stats.norm.sf(z)), z, {"prior": name})
 
 
 def residual_findings(
@@ -429,16 +404,13 @@ def residual_findings(
     """A finding for each kind of alarm, with its cases, the clearest first. `severity` is that of
     what a wrong model causes; `widened` [1] is the factor on intervals for residuals that are too
     large."""
-    found, model = dict[str, list[ResidualTest]](), systematic(tests)
+    out, model = list[Finding](), [one.code for one in systematic(tests)]
     order = sorted((one for one in tests if one.alarming), key=lambda t: (t.recording is None, t.p))
     for code in ("onset", "larger", "smaller", "white", "motion", "channels", "outliers", "priors"):
-        mine = [one for one in order if one.code == code]
-        found |= {code: mine} if mine else {}
-    out = list[Finding]()
-    for code, some in found.items():
-        facts: dict[str, Any] = {"cases": [one.case for one in some]}
-        if code == "larger" and widened >= 1.005:
-            facts["widened"] = widened
-        usual: Severity = "note" if code == "smaller" else "warning"
-        out.append(Finding(code, severity if some[0] in model else usual, facts))
+        if cases := [one.case for one in order if one.code == code]:
+            facts: dict[str, Any] = {"cases": cases}
+            if code == "larger" and widened >= 1.005:
+                facts["widened"] = widened
+            usual: Severity = "note" if code == "smaller" else "warning"
+            out.append(Finding(code, severity if code in model else usual, facts))
     return out

@@ -1,8 +1,7 @@
 """Result of an identification as plain data, with the rigs of its recordings; `answer.json` holds
 it.
 
-The schema of the file, `schema()`, is published as `docs/answer.schema.json`. A checksum of the
-content tells a damaged file.
+A checksum of the content tells a damaged file.
 """
 
 import json
@@ -13,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -215,18 +214,13 @@ class IdentificationResult(Shown):
         )
 
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
-        rows = []
-        for one in self.estimates:
-            unit = "" if one.unit == "1" else f" {one.unit}"
-            if one.value is None or one.ci95 is None:
-                rows.append(
-                    (one.label, f"not determined by the data; ended at {one.last:.4g}{unit}")
-                )
-            else:
-                low, high = one.ci95
-                rows.append((one.label, f"{one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}"))
+        rows = [(one.label, one.found) for one in self.estimates]
         rows += [(one.severity, str(one)) for one in self.findings]
         return self.headline, rows
+
+    def table(self) -> str:
+        """The headline, and a line for each estimate."""
+        return "\n".join([self.headline, *(f"{e.label:34s} {e.found}" for e in self.estimates)])
 
     @property
     def verdict(self) -> Verdict:
@@ -367,21 +361,6 @@ class IdentificationResult(Shown):
         """Write the JSON file. It appears whole or not at all."""
         save_text(path, self.to_json())
 
-    def table(self) -> str:
-        """The headline, and a line for each estimate."""
-        rows = [self.headline, f"{'parameter':34s} {'estimate':>12s}   95 % interval"]
-        for e in self.estimates:
-            if e.value is None or e.ci95 is None:
-                rows.append(
-                    f"{e.label:34s} {'none':>12s}   not identifiable (the search ended at "
-                    f"{e.last:.3g} {e.unit})"
-                )
-            else:
-                rows.append(
-                    f"{e.label:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}"
-                )
-        return "\n".join(rows)
-
 
 @cache
 def adapter() -> TypeAdapter[IdentificationResult]:
@@ -389,44 +368,8 @@ def adapter() -> TypeAdapter[IdentificationResult]:
 
 
 def checksum(content: Any) -> str:
-    """Checksum of JSON content, independent of the order of names and of whether 1 is written as
-    1.0."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(one) for key, one in value.items()}
-        if isinstance(value, list):
-            return [plain(one) for one in value]
-        return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-    return sha256(
-        json.dumps(plain(content), sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
-
-
-def schema() -> dict[str, Any]:
-    """The JSON Schema (2020-12) of the file."""
-    definition = finite(adapter().json_schema(by_alias=True, mode="serialization"))
-    definition["properties"].pop("rigs", None)
-    finding = definition["$defs"]["Finding"]
-    finding["properties"]["text"] = {"type": "string", "description": "The finding in words."}
-    finding["required"].append("text")
-    head = {
-        "schema": {"const": SCHEMA, "description": "Name and version of the file's form."},
-        "checksum": {
-            "type": "string",
-            "pattern": "^[0-9a-f]{64}$",
-            "description": "SHA-256 of the rest, names sorted.",
-        },
-        "verdict": {"enum": list(get_args(Verdict)), "description": "What is said of the model."},
-    }
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"urn:{SCHEMA}",
-        **definition,
-        "properties": head | definition["properties"],
-        "required": [*head, *definition["required"]],
-    }
+    """Checksum of JSON content, independent of the order of names."""
+    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def load_answer(path: str | Path) -> IdentificationResult:
@@ -441,15 +384,9 @@ def load_answer(path: str | Path) -> IdentificationResult:
         ) from None
     form = content.pop("schema", None) if isinstance(content, dict) else None
     if form != SCHEMA:
-        older = isinstance(content, dict) and {"estimates", "made_by"} <= content.keys()
-        reason = (
-            "an older version wrote it, so identify again"
-            if form is None and older
-            else f"its `schema` is {shown(form)}"
-        )
         raise ValueError(
-            f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: "
-            f"{reason}"
+            f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: its "
+            f"`schema` is {shown(form)}; if an older version wrote it, identify again"
         )
     if content.pop("checksum", None) != checksum(content):
         raise ValueError(

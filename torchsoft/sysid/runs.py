@@ -14,10 +14,9 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchsoft.caller import warn
@@ -42,7 +41,7 @@ from torchsoft.sysid.prediction import (
     initial_state,
     predict,
 )
-from torchsoft.sysid.recording import BETWEEN, Grid, Recording, RunContext
+from torchsoft.sysid.recording import Recording, RunContext
 
 MEANING = (
     "Runs of an identification that is not done; torchsoft removes the .run files in this folder "
@@ -166,7 +165,7 @@ class Job(NamedTuple):
     """One run: index of the recording, values of the unknowns, names to differentiate by, and
     steps.
 
-    `interpolated` requests a grid between the samples; `varied` are amounts of variations of the
+    `interpolated` requests a grid between the samples; `changes` are amounts of changes of the
     recording, by name.
     """
 
@@ -175,35 +174,27 @@ class Job(NamedTuple):
     names: tuple[str, ...]
     steps: Steps
     interpolated: bool = False
-    varied: tuple[tuple[str, float], ...] = ()
+    changes: tuple[tuple[str, float], ...] = ()
 
 
-class Simulated(Protocol):
-    """The run of a recording at the values of a job, with its derivatives if they are asked for.
-    Raises `SimulationFailed`."""
-
-    def __call__(self, one: Recording, derived: bool = False, /) -> Prediction: ...
-
-
-Vary = Callable[[Recording, float, Simulated], Recording | None]
-"""A recording with an assumption varied by an amount, which may look at runs; None where the
-variation does not apply to it."""
+Change = Callable[[Recording, float], Recording | None]
+"""A recording changed by an amount [SI]; None where the change has no meaning for it."""
 
 
 class Runner:
     """Runs jobs in `workers` threads (in this one, if it is one), and stores their results in the
-    folder `journal`. `variations` of recordings are those that jobs name."""
+    folder `journal`. `changes` of recordings are those that jobs name."""
 
     def __init__(
         self,
         recordings: Sequence[Recording],
         workers: int = 1,
         journal: Path | None = None,
-        variations: Mapping[str, Vary] | None = None,
+        changes: Mapping[str, Change] | None = None,
     ) -> None:
         if workers < 1:
             raise ValueError(f"`workers` must be positive, but is {workers}")
-        self.variations = dict(variations or {})
+        self.changes = dict(changes or {})
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.remembered = 0
         self._work = 0.0
@@ -211,21 +202,18 @@ class Runner:
         starts = {recording.start_fingerprint for recording in self.recordings}
         self._alike, self._lock = len(starts) < len(self.recordings), Lock()
         self._starts: dict[Any, tuple[Tensor, Tensor]] = {}
-        self._watched: dict[str, Prediction] = {}
         self._idle: list[list[RunContext]] = [
             [] for _ in self.recordings
         ]  # models that no thread is using
         self._parent: Runner | None = None
 
     def of(
-        self, recordings: Sequence[Recording], variations: Mapping[str, Vary] | None = None
+        self, recordings: Sequence[Recording], changes: Mapping[str, Change] | None = None
     ) -> "Runner":
         """A runner for other recordings, with the same number of threads and the same folder; what
         it runs counts here too."""
-        out = Runner(recordings, self.workers, self.folder, variations)
+        out = Runner(recordings, self.workers, self.folder, changes)
         out._parent = self
-        if [*map(id, out.recordings)] == [*map(id, self.recordings)]:
-            out._watched, out._lock = self._watched, self._lock
         return out
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
@@ -259,8 +247,8 @@ class Runner:
 
     def _made(self, job: Job) -> Any:
         """Run a job and store its result, even if an interruption is pending."""
-        if job.varied:
-            result = self._varied(job)
+        if job.changes:
+            result = self._changed(job)
         else:
             idle = self._idle[job.recording]
             try:
@@ -274,51 +262,24 @@ class Runner:
             self._journal.keep(job, result)
         return result
 
-    def _varied(self, job: Job) -> Any:
-        """Run a job of a varied recording, of which each run has another."""
+    def _changed(self, job: Job) -> Any:
+        """Run a job of a changed recording."""
         stated = self.recordings[job.recording]
-        plain, work = job._replace(varied=()), 0.0
-
-        def run(one: Recording, job: Job = plain, fine: bool = False) -> Any:
-            nonlocal work
-            tied = tuple(one.tied) if job.names else ()
-            job = job._replace(steps=since(job.steps, one.run_start), names=(*tied, *job.names))
-            made = simulated(one, one.run_context(), job, grid=between(one, job) if fine else None)
-            if isinstance(made, FailedRun):
-                raise SimulationFailed(made.reason, made.time)
-            if one is not stated:  # which is made once for many
-                work += rig_step(one.rig, len(job.names))
-            own = [one.channels.index(channel) for channel in stated.channels]  # of more actuators
-            slopes = None if made.derivatives is None else made.derivatives[:, own]
-            if slopes is not None and tied:
-                by, slopes = np.split(slopes, [len(tied)], axis=-1)
-                slopes = slopes + by @ np.stack([one.tied[name] for name in tied])
-            return made._replace(signals=made.signals[:, own], derivatives=slopes, step=work)
-
-        def watched(one: Recording, derived: bool = False) -> Prediction:
-            """The run on a fine grid, with the derivatives of the job if they are asked for; the
-            last one of the recording as stated is kept."""
-            fine = plain._replace(names=plain.names if derived else ())
-            if one is not stated:
-                return run(one, fine, True)
-            with self._lock:
-                if (found := self._watched.get(repr(fine))) is None:
-                    self._watched.clear()
-                    found = self._watched[repr(fine)] = run(one, fine, True)
-                return found
-
         recording: Recording | None = stated
         try:
             with warnings.catch_warnings(action="ignore"):  # such as of pads that creep for long
-                for name, amount in job.varied:
-                    recording = recording and self.variations[name](recording, amount, watched)
+                for name, amount in job.changes:
+                    recording = recording and self.changes[name](recording, amount)
                 if recording is None:
-                    raise ValueError(f"it has no meaning where recording `{stated.name}` begins")
-                return run(recording)
-        except ValueError as error:  # a rig that cannot be so
+                    raise ValueError(f"it has no meaning where recording `{stated.name}` starts")
+                context = recording.run_context()
+                steps = since(job.steps, recording.run_start)
+                made = simulated(recording, context, job._replace(steps=steps))
+        except ValueError as error:  # an impossible rig
             return FailedRun(str(error), 0.0)
-        except SimulationFailed as failure:
-            return FailedRun(failure.reason, failure.time)
+        if isinstance(made, FailedRun) or recording.rig is stated.rig:
+            return made
+        return made._replace(step=rig_step(recording.rig, len(job.names)))
 
     def _start(self, context: RunContext, job: Job) -> tuple[Tensor, Tensor]:
         """The initial state of a run, computed once for recordings that begin alike."""
@@ -346,11 +307,11 @@ class Runner:
 
 
 EARLY = 2e-3
-"""Steps [s] before frozen ones, where the run of a varied recording begins earlier."""
+"""Steps [s] before frozen ones, where the run of a changed recording starts earlier."""
 
 
 def since(steps: Steps, start: float) -> Steps:
-    """The same steps for a run that begins at another time [s]."""
+    """The same steps for a run that starts at another time [s]."""
     if not isinstance(steps, Frozen) or start == steps.knots[0]:
         return steps
     knots = steps.knots
@@ -358,23 +319,15 @@ def since(steps: Steps, start: float) -> Steps:
     return Frozen(np.concatenate((early, knots[knots > early[-1] + 1e-3 * EARLY])))
 
 
-def between(recording: Recording, job: Job) -> Grid:
-    """Times every `BETWEEN` from the begin of a run to its end."""
-    own = recording.grid(job.interpolated).t.numpy()
-    first, last = (job.steps.knots if isinstance(job.steps, Frozen) else own)[[0, -1]]
-    return Grid(torch.from_numpy(np.append(np.arange(first, last - 1e-9, BETWEEN), last)), 0)
-
-
 def simulated(
     recording: Recording,
     context: RunContext,
     job: Job,
     start: Callable[[], tuple[Tensor, Tensor]] | None = None,
-    grid: Grid | None = None,
 ) -> Any:
-    """A `Prediction` or a `FailedRun`, with a rig that no other thread uses; `start`
-    computes the initial state. The grid is the recording's own unless another is given."""
-    grid = recording.grid(job.interpolated) if grid is None else grid
+    """A `Prediction` or a `FailedRun`, with a rig that no other thread uses; `start` computes the
+    initial state."""
+    grid = recording.grid(job.interpolated)
     try:
         known = start() if start is not None else None
         return predict(context, job.values, grid, job.names, job.steps, known)

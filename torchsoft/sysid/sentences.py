@@ -249,6 +249,56 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "None of the {count} refitted suspects explains the misfit.",
         "Residuals still fail a test ({alarms}).",
     ),
+    # profiles
+    "profile-open": (
+        "{estimate} has no {end} bound of its 95 % interval within {value:.4g}: {reason}.",
+    ),
+    "profile-steps": (
+        "The {end} end of the profile of {estimate} is uncertain: steps chosen anew there change "
+        "|r|^2 by {change:.2g}.",
+        "Take a tighter tolerance than rtol = {rtol:g}.",
+    ),
+    # laws
+    "law": ("`{law}` made these data: {cases}.",),
+    "no-law": (
+        "None of the laws explains these data.",
+        "The best, `{best}`, has chi2 = {chi2:.3g} (p = {p:.1g}).",
+        "The best, `{best}`, misses the held-out recordings (p = {heldout_p:.1g}).",
+        "The best, `{best}`, leaves residuals that follow {patterned}.",
+        "It is nearer than {ahead}, but that does not make it right.",
+        "Or the noise is not as it was stated: it is larger, or coloured.",
+    ),
+    "laws-alike": ("The data cannot tell which law made them.",),
+    "law-contradicted": (
+        "Held-out recordings speak for `{other}` and fitted ones for `{best}`, each by more than "
+        "noise does.",
+    ),
+    "law-evidence": (
+        "The evidence for `{best}` over `{other}` is {evidence:.2g} nats ({enough:g} are needed), "
+        "and z = {z:.2g} ({apart:g} is needed).",
+        "The steps of the simulation change the evidence by {numerical:.2g}: take a tighter "
+        "tolerance.",
+        "Their predictions differ by {distance:.2g} times the noise over all samples together: "
+        "these motions and sensors cannot tell them apart.",
+    ),
+    "law-unconverged": (
+        "The fit of `{law}` has not converged, so it may be better than it looks.",
+    ),
+    # designs
+    "design-interrupted": ("Interrupted after {done} of {iterations} iterations.",),
+    "design-limit": ("{channel} reaches {part:.1%} of the way to its limits.",),
+    "design-nonlinear": (
+        "A fit with rtol = {rtol:g} that starts a standard deviation from the truth ends {off:.2g} "
+        "of them from it in `{estimate}`.",
+        "Take finer steps, and count intervals that hold before this motion is used.",
+    ),
+    "design-failed": ("{count} motions that the search tested could not be run.",),
+    "design-file": (
+        "The written file cannot be run: {failure}.",
+        "motion.{signal} of the written file is up to {off:.3g} off what the search found, of "
+        '{most:.3g}: the file makes "start" or "held" anew with the new motion; give numbers in '
+        "their place.",
+    ),
 }
 """Sentences by code, the first one short. A sentence without a fact in it is always there."""
 
@@ -273,6 +323,7 @@ CASES: dict[str, tuple[str, ...]] = {
     "alarms": ("{test}", " in {channel} of `{recording}`"),
     "no-suspect": ("{name}", " ({part:.0%} of the misfit)"),
     "causes": (*SUSPECT, ", score {score:.2g}"),
+    "law": ("`{other}` is behind by {evidence:.3g} nats, {z:.2g} standard deviations",),
 }
 CASES |= {"smaller": CASES["larger"]}
 """Clauses of one case by the code of its finding; suspects are the default."""

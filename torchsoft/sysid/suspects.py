@@ -6,6 +6,7 @@ from typing import Any
 
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.assumptions import AMOUNTS
+from torchsoft.sysid.search import RIVAL
 from torchsoft.sysid.sensitivity import Checked
 from torchsoft.sysid.sentences import TESTS, Finding, Severity
 
@@ -40,7 +41,6 @@ def suspect_findings(checked: Checked, unexplained: Severity) -> list[Finding]:
         return without_suspect(checked, unexplained)
     best, *others = checked.favoured
     facts: dict[str, Any] = {"cases": [best.case], "gain": best.gain}
-    candidates = [one for one in checked.checks if one.name in checked.candidates]
     estimate, shift = best.shift
     if not checked.as_stated:
         facts["others"] = [one.name for one in others if one.score > LIKELY]
@@ -50,34 +50,44 @@ def suspect_findings(checked: Checked, unexplained: Severity) -> list[Finding]:
         if not checked.left:
             facts["besides"] = [one.name for one in checked.besides]
         return [Finding("nearest" if best.refitted else "likeliest", "error", facts)]
-    if len(candidates) > 1:
-        cases = [one.case for one in sorted(candidates, key=lambda one: -one.gain)]
+    rivals = [one for one in checked.checks if one.suspected and one.gain > RIVAL * best.gain]
+    if not best.refitted and len(rivals) > 1:
+        cases = [one.case for one in sorted(rivals, key=lambda one: -one.gain)]
         return [Finding("rivals", "warning", {"cases": cases, "count": len(cases)})]
-    if best.far and len(candidates) < 2:
+    if best.far:
         return [Finding("far", "warning", facts | {"estimate": estimate, "shift": abs(shift)})]
     likely = [best, *(one for one in others if one.score > LIKELY and one.passed)]
-    if len(likely) > 1:
-        cases = [one.case | {"score": one.score} for one in likely]
-        facts |= {"cases": cases, "count": len(likely), "between": between(likely)}
-        return [Finding("causes", "warning", facts)]
-    facts["stated"] = best.stated
+    return [cause(best) if len(likely) == 1 else causes(likely)]
+
+
+def cause(best: AssumptionTest) -> Finding:
+    """The finding of one cause."""
+    estimate, shift = best.shift
+    facts: dict[str, Any] = {"cases": [best.case], "gain": best.gain, "stated": best.stated}
     if best.under:
         under = dict(list(best.under.items())[:UNDER])
         facts |= {"estimate": estimate, "shift": abs(shift), "under": under}
     elif estimate:
         facts["unconverged"] = best.name
-    return [Finding("cause", "warning", facts)]
+    return Finding("cause", "warning", facts)
+
+
+def causes(likely: Sequence[AssumptionTest]) -> Finding:
+    """The finding of causes that the data cannot tell apart, the likeliest first."""
+    cases = [one.case | {"score": one.score} for one in likely]
+    facts = {"cases": cases, "gain": likely[0].gain, "count": len(likely)}
+    return Finding("causes", "warning", facts | {"between": between(likely)})
 
 
 def without_suspect(checked: Checked, severity: Severity) -> list[Finding]:
     """A finding where the data favour no suspect, and residuals fail a test."""
     refitted = [one for one in checked.checks if one.refitted]
-    if checked.candidates and checked.alarms:
+    if checked.alarms and not checked.searched:
         nearest = sorted(checked.checks, key=lambda one: -one.gain)[:NEAREST]
         square = max((one.left + one.gain for one in checked.checks), default=1.0)
         cases = [{"name": one.name, "part": one.gain / square} for one in nearest]
         return [Finding("no-suspect", severity, {"cases": cases})]
-    if checked.alarms and refitted:
+    if checked.alarms:
         facts = {"count": len(refitted), "alarms": alarms_of(checked)}
         return [Finding("none", severity, facts)]
     return []
@@ -126,35 +136,27 @@ def risk_findings(checked: Checked) -> list[Finding]:
     """Errors of the assumptions that the data would not show though an estimate would move by more
     than a standard deviation: the largest shift, and the assumptions that the data contradict,
     though not evidently."""
-    hidden, exact, hinted = list[AssumptionTest](), list[AssumptionTest](), list[AssumptionTest]()
-    measured = [c for c in checked.checks if c.kind in ("known", "sensor") and not c.unchecked]
-    for c in measured:
-        if abs(c.favoured) > CONTRADICTED * c.favoured_sd and (c.favoured > 0 or not c.one_sided):
-            hinted.append(c)
-        if c.suspected:
-            continue
-        if c.detectable <= AMOUNTS * c.amount and abs(c.impact[1]) >= 1.0:
-            hidden.append(c)
-        elif c.detectable > AMOUNTS * c.amount and abs(c.most_moved[1]) >= 1.0:
-            exact.append(c)
+    measured = [c for c in checked.checks if c.has_amount and not c.unchecked]
+    known = [c for c in measured if not c.suspected]
+    hidden = [c for c in known if c.detectable <= AMOUNTS * c.amount and abs(c.impact[1]) >= 1.0]
+    exact = [c for c in known if c.detectable > AMOUNTS * c.amount and abs(c.most_moved[1]) >= 1.0]
     hidden.sort(key=lambda c: -abs(c.impact[1]))
     exact.sort(key=lambda c: -abs(c.most_moved[1]))
-    out = list[Finding]()
-    for c in hidden[:1]:
-        estimate, shift, amount = c.impact
-        facts: dict[str, Any] = {"estimate": estimate, "shift": abs(shift), "name": c.name}
-        facts["size"] = f"{amount:.2g} {c.unit}".strip()
-        out.append(Finding("undetectable", "note", facts))
-    for c in exact[:1]:
-        estimate, shift = c.most_moved
-        facts = {"estimate": estimate, "shift": abs(shift), "name": c.name}
-        facts["size"] = f"{c.amount:.2g} {c.unit}".strip()
-        out.append(Finding("exact", "note", facts))
+    out = [risk("undetectable", c, *c.impact) for c in hidden[:1]]
+    out += [risk("exact", c, *c.most_moved, c.amount) for c in exact[:1]]
     if more := [c for c in hidden[1:] if abs(c.impact[1]) >= CONTRADICTED]:
-        facts = {"count": len(more), "shift": abs(more[0].impact[1])}
-        facts["names"] = [c.name for c in more]
-        out.append(Finding("undetectable-others", "note", facts))
-    if hinted:
+        facts: dict[str, Any] = {"count": len(more), "shift": abs(more[0].impact[1])}
+        out.append(
+            Finding("undetectable-others", "note", facts | {"names": [c.name for c in more]})
+        )
+    contradicted = [c for c in measured if abs(c.favoured) > CONTRADICTED * c.favoured_sd]
+    if hinted := [c for c in contradicted if c.favoured > 0 or not c.one_sided]:
         facts = {"cases": [c.case for c in hinted], "tested": len(measured)}
         out.append(Finding("hinted", "note", facts))
     return out
+
+
+def risk(code: str, one: AssumptionTest, estimate: str, shift: float, size: float) -> Finding:
+    """A note that an amount of an assumption shifts an estimate by so many standard deviations."""
+    facts: dict[str, Any] = {"estimate": estimate, "shift": abs(shift), "name": one.name}
+    return Finding(code, "note", facts | {"size": f"{size:.2g} {one.unit}".strip()})

@@ -6,7 +6,7 @@ deviation is a relative one either way.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, Self, TypeVar, get_args
 
@@ -50,11 +50,6 @@ class Prior(Table):
         if self.kind == "log-normal":
             return math.log(value / self.median) / self.sd, 1 / (value * self.sd)
         return (value - self.median) / self.sd, 1 / self.sd
-
-    def draw(self, rng: np.random.Generator) -> float:
-        """A random value."""
-        z = self.sd * float(rng.standard_normal())
-        return self.median * math.exp(z) if self.kind == "log-normal" else self.median + z
 
 
 class Unknown(Table):
@@ -121,7 +116,7 @@ FAULTS: dict[str, Fault] = {
     "delay": Fault("s", "came late", 1e-4, 0.02),
     "gain": Fault("1", "were too sensitive", 1e-3, 0.5),
     "drift": Fault("{}/s", "drifted upwards", 0.1, 1e4, grows=True),
-    "misalignment": Fault("rad"),
+    "misalignment": Fault("rad", "were turned", 1e-3, 0.2),
     "inertia": Fault("kg"),
     "clock": Fault("1", "ran too fast", 1e-4, 0.05, grows=True),
     "lag": Fault("s", "came through a low-pass", 1e-4, 0.05, one_sided=True),
@@ -216,10 +211,11 @@ def in_full(rigs: Sequence[Rig], given: Mapping[str, T]) -> dict[str, T]:
 
 def by_parameter(rigs: Sequence[Rig], unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
     """Unknowns by the full names of the rigs' parameters."""
-    out = dict[str, Unknown]()
-    for name, one in in_full(rigs, unknowns).items():
-        (base,) = in_full(rigs, {one.ratio_to: one}) if one.ratio_to is not None else (None,)
-        out[name] = one if base == one.ratio_to else one.model_copy(update={"ratio_to": base})
+    out = in_full(rigs, unknowns)
+    for name, one in out.items():
+        if one.ratio_to is not None:
+            (base,) = in_full(rigs, {one.ratio_to: one})
+            out[name] = one.model_copy(update={"ratio_to": base})
     return out
 
 
@@ -229,10 +225,9 @@ def by_channel(
     """Sensors by the full names of channels. A sensor named after an array of touch of the rigs,
     such as "skin.normal", stands for each of its channels (of those `sampled`, if given) without a
     sensor of its own."""
-    sensors = in_full(rigs, sensors)
     arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
     shared, own = dict[str, Sensor](), dict[str, Sensor]()
-    for name, sensor in sensors.items():
+    for name, sensor in in_full(rigs, sensors).items():
         every = [f"{name}.{i}" for i in range(arrays.get(name, 0))]
         there = [one for one in every if sampled is None or one in sampled]
         shared |= dict.fromkeys(there, sensor)
@@ -243,10 +238,10 @@ def by_channel(
 @dataclass(frozen=True)
 class Coordinate:
     """One entry of the vector of coordinates: name and kind, its bounds and start in physical
-    units, its scale, and its prior. A `variation` is an assumption of which this is the amount."""
+    units, its scale, and its prior. An `alternative` changes the recordings by an amount."""
 
     name: str
-    kind: Literal["parameter", "start", "variation"] | Nuisance
+    kind: Literal["parameter", "start", "alternative"] | Nuisance
     recording: str | None
     nominal: float
     low: float
@@ -264,7 +259,7 @@ class Coordinate:
     @property
     def label(self) -> str:
         """Readable name: `materials.rubber.E`, `bodies.a.mass / bodies.b.mass`, `delay of x_C`."""
-        plain = self.of_the_rig or self.kind == "variation"
+        plain = self.of_the_rig or self.kind == "alternative"
         quantity = self.name if plain else f"{self.kind} of {self.name}"
         ratio = f" / {self.ratio_to}" if self.ratio_to else ""
         return f"{quantity}{ratio}" + (f" in {self.recording}" if self.recording else "")
@@ -351,35 +346,35 @@ it."""
 
 
 def check_unknown(
-    name: str,
-    u: Unknown,
-    unknowns: Mapping[str, Unknown],
-    recordings: Sequence[Recording],
-    given: Mapping[str, float],
+    name: str, u: Unknown, unknowns: Mapping[str, Unknown], recordings: Sequence[Recording]
 ) -> None:
     """Raises `ValueError` for an unknown that is no scalar parameter of every rig, or whose ratio
-    is to something else; `given` are the parameters of the first rig."""
+    is to something else."""
+    rig, given = recordings[0].rig, parameters(recordings[0])
     for one in given.keys() & {name, u.ratio_to}:
         if without := next((r.name for r in recordings[1:] if one not in r.parameters), None):
             raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`")
     if name not in given:
-        tensors = dict(recordings[0].rig.named_parameters())
-        several = tensors.get(recordings[0].rig.aliases.get(name, name))
-        if several is not None and several.ndim:
-            raise ValueError(
-                f"unknowns: `{line(name, 80)}` cannot be identified: it has "
-                f"{several.numel()} numbers, and an unknown is one"
-            )
+        several = dict(rig.named_parameters()).get(rig.aliases.get(name, name))
+        many = several is not None and several.ndim
+        why = f"it has {several.numel()} numbers, and an unknown is one" if many else ""
         raise ValueError(
             f"unknowns: `{line(name, 80)}` cannot be identified; "
-            f"{suggestion(name, given, 'known:')}"
+            f"{why or suggestion(name, given, 'known:')}"
         )
-    if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
+    if (base := u.ratio_to) is None:
+        return
+    if base not in given or base == name:
         raise ValueError(
-            f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is not another parameter of the model"
+            f"unknowns.{name}.ratio_to = {shown(base)} is not another parameter of the model"
         )
-    if u.ratio_to is not None and u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
-        raise ValueError(f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself")
+    if base in unknowns and unknowns[base].ratio_to:
+        raise ValueError(f"unknowns.{name}.ratio_to = {shown(base)} is a ratio itself")
+
+
+def parameters(recording: Recording) -> dict[str, float]:
+    """Values of the parameters of a recording's rig."""
+    return {k: value for k, value in recording.parameters.items() if not k.startswith(PREFIX)}
 
 
 def parameter_coordinate(
@@ -418,10 +413,29 @@ def parameter_coordinate(
     )
 
 
+def start_coordinates(recordings: Sequence[Recording]) -> Iterator[Coordinate]:
+    """Coordinates of the starts of runs, with bounds at `BOUNDS` standard deviations."""
+    for r in recordings:
+        for name, mean, sd in r.start_coordinates:
+            low, high, prior = mean - BOUNDS * sd, mean + BOUNDS * sd, Prior(median=mean, sd=sd)
+            yield Coordinate(name, "start", r.name, mean, low, high, prior=prior)
+
+
+def fault_coordinates(
+    sensors: Mapping[str, Sensor], recordings: Sequence[Recording]
+) -> Iterator[Coordinate]:
+    """Coordinates of the faults of sensors to identify, one for all recordings or one for each."""
+    for channel, sensor in sensors.items():
+        seen = [r.name for r in recordings if channel in r.samples]
+        for kind, (low, nominal, high) in sensor.nuisances.items():
+            for where in seen if sensor.per == "recording" else [None]:
+                yield Coordinate(channel, kind, where, nominal, low, high)
+
+
 class Coordinates:
     """All coordinates of a problem, in a fixed order, and the map from their vector x (n,) to
-    parameters of the rig, starts of runs, faults of sensors, and amounts of variations, which have
-    bounds by name. Coordinates `held`, by label, are not free.
+    parameters of the rig, starts of runs, faults of sensors, and amounts of alternatives, which
+    have bounds by name. Coordinates `held`, by label, are not free.
 
     Raises `ValueError` for unknowns that some recording's rig lacks, a ratio to an unknown
     parameter, or a nominal value or median of a prior out of bounds.
@@ -436,34 +450,17 @@ class Coordinates:
         held: Collection[str] = (),
     ) -> None:
         self.recordings, self.all = tuple(r.name for r in recordings), list[Coordinate]()
-        given = {
-            name: value
-            for name, value in recordings[0].parameters.items()
-            if not name.startswith(PREFIX)
-        }
         for name, u in unknowns.items():
-            check_unknown(name, u, unknowns, recordings, given)
+            check_unknown(name, u, unknowns, recordings)
             one = parameter_coordinate(name, u, unknowns, recordings)
             every = (None,) if u.per == "all" else self.recordings
             self.all += [replace(one, recording=where) for where in every]
         for r in recordings:
             for pair in r.rig.ordered.items():
                 self._check_order(*pair, r.parameters)
-        for r in recordings:
-            for name, mean, sd in r.start_coordinates:
-                low, high = mean - BOUNDS * sd, mean + BOUNDS * sd
-                prior = Prior(median=mean, sd=sd)
-                self.all.append(Coordinate(name, "start", r.name, mean, low, high, prior=prior))
-        for channel, sensor in sensors.items():
-            for kind, (low, nominal, high) in sensor.nuisances.items():
-                seen = (
-                    [r.name for r in recordings if channel in r.samples]
-                    if sensor.per == "recording"
-                    else [None]
-                )
-                self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
+        self.all += [*start_coordinates(recordings), *fault_coordinates(sensors, recordings)]
         for name, (low, high) in (amounts or {}).items():
-            self.all.append(Coordinate(name, "variation", None, 0.0, low, high))
+            self.all.append(Coordinate(name, "alternative", None, 0.0, low, high))
         self.all = [replace(c, fixed=c.fixed or c.label in held) for c in self.all]
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 

@@ -1,0 +1,285 @@
+"""Search for the cause of a misfit: refits with one suspect free after the other.
+
+1. Score tests of all suspects order them: those that would explain most come first, and those with
+   costly runs last.
+2. Successive halving: every suspect of a bracket gets one step; then the best third goes on with
+   three times as many evaluations, until a few finalists are left.
+3. Finalists are fitted until they converge, on fine steps. The search ends after a bracket in which
+   one explains the misfit, and when refits took all of the effort.
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from torchsoft.display import hidden
+from torchsoft.sysid.assumption_tests import EVIDENT, AssumptionTest, Linearised
+from torchsoft.sysid.assumptions import AMOUNTS, Suspect
+from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
+from torchsoft.sysid.plan import LOOSE, USUAL, continued, refine_steps, scanned
+from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
+from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.unknowns import FAULTS, Unknown
+from torchsoft.tables import plain
+
+BRACKET, FINALISTS = 16, 3
+"""Suspects of a bracket, and those of it that are fitted until they converge."""
+
+FAR = 2.0
+"""Misfit per sample above which score tests order suspects wrongly, so that the first
+bracket has all of them but costly ones."""
+
+KEPT = 3
+"""One in so many suspects goes on after a round, with so many times as many evaluations."""
+
+COMPLETE, ROUGH = 20, 1e-3
+"""Most evaluations of a finalist, and its relative tolerance."""
+
+TIGHTENINGS = 2
+"""Most times that a finalist goes on with a tenth of its tolerance."""
+
+COMPARABLE = 2 * EVIDENT
+"""Sum of squares that a finalist may leave beyond the best one and still go on until it has
+converged: what is evident, and as much for the steps of the fit, which are not its own."""
+
+PARTS = (1.0, 0.25, 0.0625)
+"""Parts of the first step that are tested."""
+
+FIRST_STEP = 1.0
+"""Longest first step of the fitted coordinates together."""
+
+NEARLY = 0.99
+"""Part of the misfit above the noise from which on a suspect seems to explain it."""
+
+RIVAL = 0.5
+"""Part of the gain of such a suspect from which on another is its rival."""
+
+HALVINGS = 10
+"""Most halvings of the range of a suspect where the rig is impossible at its end."""
+
+
+# A suspect becomes free
+
+
+def free(problem: Problem, one: Suspect, held: bool = False) -> Problem:
+    """The problem with the coordinate of a suspect, which is free unless `held`; that of an
+    alternative that holds or does not is held always. Raises `ValueError` where it cannot be."""
+    unknowns, sensors, fixed = dict(problem.unknowns), dict(problem.sensors), set(problem.held)
+    alternatives = [*problem.alternatives.values()]
+    if held or not one.has_amount:
+        fixed.add(one.label)
+    if one.extension or (one.parameter and held and one.nominal > 0):
+        unknowns[one.parameter] = Unknown()
+    elif one.parameter:
+        reach = AMOUNTS * one.step / one.nominal
+        low, high = sorted(
+            farthest(problem.recordings, one.parameter, one.nominal, part)
+            for part in (-reach, reach)
+        )
+        scale = "log" if low > 0 else "linear"
+        unknowns[one.parameter] = Unknown(nominal=one.nominal, low=low, high=high, scale=scale)
+    elif one.fault is not None:
+        channel, kind = one.fault
+        longest = max(1.0, *(recording.duration for recording in problem.recordings))
+        most = FAULTS[kind].most * FAULTS[kind].scale(sensors[channel], longest)
+        sensors[channel] = sensors[channel].model_copy(update={kind: most})
+    else:
+        alternatives.append(one)
+    return Problem(problem.recordings, sensors, unknowns, problem.noise, alternatives, fixed)
+
+
+def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
+    """A parameter changed by a relative `part`, halved until the rig is possible: kinetic friction
+    must not exceed static friction. Raises `ValueError` where it never is."""
+    for _ in range(HALVINGS):
+        with suppress(ValueError):
+            for recording in recordings:
+                check_possible(recording, {name: value * (1 + part)})
+            return value * (1 + part)
+        part /= 2
+    raise ValueError(f"{name} = {value:g} can hardly be varied")
+
+
+def opened(end: Fit, one: Suspect) -> Fit:
+    """The fit with a suspect free, at its end and at the suspect's neutral value; an alternative
+    that holds or does not is in force. Raises `ValueError` for one that cannot be free."""
+    problem = free(end.problem, one)
+    c = problem.coordinates
+    x, i = c.with_known(end.by_label), c.labels.index(one.label)
+    x[i] = c.all[i].to_x(one.nominal if one.has_amount else 1.0)
+    labels = (*end.labels, *(one.label for _ in range(one.has_amount)))
+    stage = Stage(one.name, end.which, labels, end.rtol, COMPLETE, ROUGH)
+    return Fit(problem, problem.runner(end.runner), x, stage, loss=end.loss, notify=end.notify)
+
+
+# Columns of suspects
+
+
+def coarsened(end: Fit) -> Fit:
+    """The end of a fit at the tolerance of score tests: `USUAL`, or its own if such runs fail. Its
+    `check` has the tolerance of the fit, and the residuals that are tested. A fit whose steps could
+    not be checked stays on them."""
+    if end.check.bias is None:
+        return end._replace(at=end.check.finer)
+    usual = max(end.rtol, USUAL)
+    base = end.residuals(steps=usual)
+    if base.failed and usual > end.rtol:
+        usual = end.rtol
+        base = end.residuals(steps=usual)
+    return end.by(usual)._replace(at=base)
+
+
+Column = tuple[Suspect, Array | None, str]
+"""A suspect with the change of the residuals (m,) by its amount, or None and the reason."""
+
+
+def exact_columns(end: Fit, some: Sequence[Suspect]) -> tuple[list[Column], Array | None]:
+    """Columns of suspects that are coordinates, and the Jacobian (m, n) of the fitted coordinates,
+    from one run of each recording. Empty where it fails."""
+    out, wide, mine = list[Column](), end.problem, list[Suspect]()
+    for one in (one for one in some if one.change is None):
+        try:
+            wide = free(wide, one, held=True)
+            mine.append(one)
+        except ValueError as error:
+            out.append((one, None, str(error)))
+    c = wide.coordinates
+    names = np.isin(c.labels, [*end.labels, *(one.label for one in mine)])
+    x = c.with_known(end.by_label)
+    at = wide.residuals(wide.runner(end.runner), x, end.which, end.at.steps, names)
+    if at.failed:
+        return [], None
+    for one in mine:
+        i = c.labels.index(one.label)
+        out.append((one, at.J[:, i] * (one.step / c.all[i].slope(x[i])), ""))
+    return out, at.J[:, [c.labels.index(label) for label in end.labels]]
+
+
+def difference_column(end: Fit, one: Suspect) -> Column:
+    """Column of an alternative, from a run of each recording on the same steps. That of one of
+    either sign is by a part of its amount: coordinates take most of an effect, and what its
+    curvature leaves must not hide the rest."""
+    part = DIFFERENCE if one.has_amount and not one.one_sided else 1.0
+    problem = free(end.problem, one, held=True)
+    c = problem.coordinates
+    x, i = c.with_known(end.by_label), c.labels.index(one.label)
+    x[i] = c.all[i].to_x(part * one.step)
+    got = problem.residuals(problem.runner(end.runner), x, end.which, end.at.steps)
+    return (one, None, got.reason) if got.failed else (one, (got.r - end.at.r) / part, "")
+
+
+# The search
+
+
+def search(
+    end: Fit, some: Sequence[Suspect], tests: Mapping[str, AssumptionTest], linear: Linearised,
+    effort: float,
+) -> Iterator[tuple[AssumptionTest, Fit | None]]:  # fmt: skip
+    """Refit with one suspect free after the other, as the head of this module says, from the `end`
+    of a fit and the score `tests` of the suspects.
+
+    Yields the test of every suspect that was tried: of finalists that of the refit, and the refit.
+    It ends when refits took `effort` times the work of the fit.
+    """
+    queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))  # 1.
+    most = end.runner.work * (1.0 + effort)
+    bar = tqdm(total=len(queue), unit="suspect", disable=hidden(end.progress))
+    with bar, warnings.catch_warnings(action="ignore"):
+        end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
+        size = sum(not one.costly for one in queue) if end.chi2 > FAR else BRACKET
+        while queue and end.runner.work < most:
+            bracket, queue = queue[:size], queue[size:]
+            fits, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
+            while len(fits) > FINALISTS:
+                kept = best_of(fits, linear)
+                bar.set_description(f"{len(kept)} suspects, {evaluations} evaluations each")
+                fits = {one: carried_on(fits[one], evaluations) for one in kept}
+                evaluations *= KEPT
+            dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
+            yield from ((test, None) for test in dropped)
+            best, explained = np.inf, False
+            for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
+                bar.set_description(plain(f"refit with {one.name} free"))
+                refit = finished(fits[one].by(end.rtol), best + COMPARABLE)
+                test = linear.refit_test(one, refit, tests[one.name])
+                yield test, refit
+                best = min(best, refit.square)
+                explained = explained or bool(test.suspected and test.passed)
+            if explained:
+                return
+
+
+def first_steps(
+    end: Fit, bracket: Sequence[Suspect], tests: Mapping[str, AssumptionTest], linear: Linearised,
+    bar: "tqdm[Any]",
+) -> dict[Suspect, Fit]:  # fmt: skip
+    """First steps with each suspect of a bracket, of those that can be simulated."""
+    fits = dict[Suspect, Fit]()
+    for one in bracket:
+        bar.set_description(plain(f"first step with {one.name} free"))
+        if (fit := first_step(end, one, tests[one.name], linear)) is not None:
+            fits[one] = fit
+        bar.update()
+    return fits
+
+
+def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised) -> Fit | None:
+    """The fit with a suspect free after the step that its score test predicts, or the best of some
+    parts of it, at the tolerance `LOOSE`; None where it cannot be simulated."""
+    try:
+        start = opened(end, one.within(test.favoured)).by(max(LOOSE, end.rtol))
+    except ValueError:
+        return None
+    c, step = start.problem.coordinates, np.zeros(len(start.x))
+    for (label, move), sd in zip(test.moves.items(), linear.sd):
+        step[c.labels.index(label)] = move * sd
+    times, i = 1.0, c.labels.index(one.label)
+    if one.has_amount:
+        times = test.favoured / test.amount
+        step[i] = one.step / c.all[i].slope(start.x[i])
+    longest = abs(times) * float(np.linalg.norm(step[start.free]))
+    times, best = times / max(1.0, longest / FIRST_STEP), None
+    for part in PARTS:
+        x = start.within_bounds(start.x + part * times * step)
+        at = start.residuals(x, steps=start.rtol)
+        if not at.failed:
+            fit = start._replace(x=x, at=at)
+            best = fit if best is None or fit.square < best.square else best
+        if best is not None and best.square < linear.square:
+            break
+    return best
+
+
+def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
+    """The fits that go on after a round: those that leave least, without those far behind one that
+    explains the misfit."""
+    ranked = sorted(fits, key=lambda one: fits[one].square)
+    kept = ranked[: max(len(ranked) // KEPT, FINALISTS)]
+    gains = {one: linear.square - fits[one].square for one in kept}
+    if gains[kept[0]] < NEARLY * (linear.square - linear.dof):
+        return kept
+    return [one for one in kept if gains[one] >= RIVAL * gains[kept[0]]]
+
+
+def carried_on(fit: Fit, evaluations: int) -> Fit:
+    """The fit after some more evaluations on its steps, or as it is where these fail."""
+    with suppress(Unreachable):
+        return gauss_newton(fit, evaluations, ROUGH, anew=True)
+    return fit
+
+
+def finished(fit: Fit, most: float = np.inf) -> Fit:
+    """The fit, continued until it converges, with ratios at a bound scanned over their whole range;
+    on fine steps where it leaves at most `most` of the sum of squares."""
+    c = fit.problem.coordinates
+    stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
+    stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
+    end = continued(fit, stage) or fit
+    if end.square > most:
+        return end._replace(converged=False)
+    return refine_steps(end, TIGHTENINGS if end.loss == "linear" else 0)
