@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs  # pyright: ignore[reportAttribut
 from torch import Tensor
 
 from torchsoft.physics.mesh import Array
-from torchsoft.physics.pads import Pad, nodal
+from torchsoft.physics.pads import Pad, under_forces
 
 HALVINGS = 12
 """Halvings of a step of Newton's method at the most."""
@@ -92,7 +92,7 @@ class Points:
 
     def moved(self, f: Tensor) -> Tensor:
         """Points under forces f (..., points, 2) on them."""
-        return self.N @ (self.free + nodal(self.A, self.N.mT @ f))
+        return self.N @ (self.free + under_forces(self.A, self.N.mT @ f))
 
     def residual(self, x: Tensor) -> Tensor:
         return self.moved(self.law(x)) - x
@@ -105,15 +105,15 @@ class Points:
         if not len(sloped):
             return lambda r: r
         G, own = G[..., sloped, :, :], N[sloped]
-        spread = torch.kron(own, torch.eye(2, dtype=N.dtype))
-        B = (spread @ A @ spread.mT).unflatten(-1, (-1, 2))
-        J = torch.eye(len(spread), dtype=x.dtype)
+        components = torch.kron(own, torch.eye(2, dtype=N.dtype))
+        B = (components @ A @ components.mT).unflatten(-1, (-1, 2))
+        J = torch.eye(len(components), dtype=x.dtype)
         J = J - torch.einsum("rpj,...pjk->...rpk", B, G).flatten(-2)
 
         def solve(r: Tensor) -> Tensor:
             step = torch.linalg.solve(J, r[..., sloped, :].flatten(-2)[..., None])
             force = (G @ step.unflatten(-2, (-1, 2)))[..., 0]
-            return r + N @ nodal(A, own.mT @ force)
+            return r + N @ under_forces(A, own.mT @ force)
 
         return solve
 
@@ -153,8 +153,8 @@ class Banded:
         """The factorised derivative of the residual, internal less contact forces, of those of the
         elements' forces (elements, 8, 8) and of the points' (points, 2, 2)."""
         A = np.zeros((3 * self.band + 1, self.size), order="F")
-        spread = self.shares[:, :, :, None, None] * contacts[:, None, None]
-        values = np.concatenate((elements[self.kept], -spread.ravel()))
+        on_nodes = self.shares[:, :, :, None, None] * contacts[:, None, None]
+        values = np.concatenate((elements[self.kept], -on_nodes.ravel()))
         np.add.at(A, (2 * self.band + self.row - self.column, self.column), values)
         return Factor(A, self.band)
 

@@ -20,7 +20,7 @@ from torchsoft.physics.contact import (
     point_place,
 )
 from torchsoft.physics.graph import Evaluation, Graph
-from torchsoft.physics.pads import free_rates, nodal
+from torchsoft.physics.pads import free_rates, under_forces
 from torchsoft.physics.state import State
 
 Displacements = Mapping[str, Tensor]
@@ -156,8 +156,8 @@ def contact_states(
         rate = rates[name][..., :2] if pad.nodal else _rates(rig, name, touched, state, u, force)
         for key, which in touched.items():
             law, shape = rig.contacts[key].law, rig.shape_of(key)
-            spread = pad.spread[which]
-            x = rig.point_inputs(key, state, spread @ u, spread @ rate, which)
+            shares = pad.spread[which]
+            x = rig.point_inputs(key, state, shares @ u, shares @ rate, which)
             slips = torch.zeros(force[key].shape[:-1], dtype=torch.int8)
             slips[..., which] = (PointLaw.of(interface_law(law, shape, x)).slip > 0).to(torch.int8)
             out[key] = (force[key][..., 0] > 0).to(torch.int8) * (STICKING + slips)
@@ -172,11 +172,11 @@ def _rates(
     pad = rig.pads[name]
     f = torch.zeros_like(u)
     for key, which in touched.items():
-        spread = pad.spread[which]
-        at = spread @ u
+        shares = pad.spread[which]
+        at = shares @ u
         x = rig.point_inputs(key, state, at, torch.zeros_like(at), which)
         frame = moving_frame(rig.shape_of(key), *point_place(x))
         F_N, F_T = force[key][..., which, :].split(1, -1)
-        f = f + spread.mT @ (F_N * frame.n + F_T * frame.t)
+        f = f + shares.mT @ (F_N * frame.n + F_T * frame.t)
     free, P = free_rates(pad, state.pads[name], 0.0)
-    return free + nodal(P, f)
+    return free + under_forces(P, f)

@@ -28,7 +28,7 @@ from torchsoft.physics.elements import CORNERS
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import check_names
-from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal
+from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, under_forces
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, weight
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import (
@@ -297,7 +297,7 @@ class Graph(nn.Module):
         if pad.nodal:
             return part if pad.fields == 1 else part[..., :2]
         fractions, _ = pad.chain()
-        return nodal(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
+        return under_forces(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
 
     def penetration(self, name: str, state: State, u: Tensor | None = None) -> Tensor:
         """Depth of the points of a contact in the body [m], (..., points); negative where they are
@@ -504,7 +504,7 @@ class Graph(nn.Module):
             first = law(torch.zeros_like(pad.spread @ free))
         F, left = contact_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
         self._check_rates(name, left)
-        return free + nodal(P, F)
+        return free + under_forces(P, F)
 
     def _branch_rates(self, name: str, state: State) -> Tensor:
         """Rates (..., nodes, 2 branches) [m/s] of the relaxing branches of a nodal pad."""

@@ -147,7 +147,7 @@ class Pad(nn.Module):
         own = {name: getattr(self, name) for name in ("base", "angle", "mirrored", "inertial")}
         ratios = {name: getattr(self, name) for name in ("E_ratio", "tau_ratio")}
         known = {name: None if one is None else one.item() for name, one in ratios.items()}
-        material = described(self.material)
+        material = None if len(self.material.added) else described(self.material)
         if material is None:
             relaxed = {name: getattr(self.material, name).item() for name in RELAXED}
             material = {"kind": None, "finite": isinstance(self.material, Hyperelastic), **relaxed}
@@ -157,15 +157,13 @@ class Pad(nn.Module):
     @classmethod
     def again(cls, described: Mapping[str, Any], mesh: Mesh) -> "Pad":
         """The pad that was `described`, on its mesh."""
-        given = dict(described["material"])
-        if given["kind"] is not None:
-            material = again(given)
+        known = described["material"]
+        if known["kind"] is not None:
+            material = again(known)
+        elif known["finite"]:
+            material = Hyperelastic(known["E"], known["nu"], known["rho"], 1.0, known["depth"])
         else:
-            E, nu, rho, depth = (given[name] for name in RELAXED)
-            finite = given["finite"]
-            material = (
-                Hyperelastic(E, nu, rho, 1.0, depth) if finite else Material(E, nu, rho, depth)
-            )
+            material = Material(*(known[name] for name in RELAXED))
         return cls(mesh, **{**described, "material": material})
 
     @property
@@ -542,11 +540,12 @@ def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
     [m/(N.s)], for the forces z (..., branches, nodes, 2) that have set in at the stage's start."""
     fractions, times = pad.chain()
     C, rest = pad.compliance(), fractions / (times + stage)
-    return -nodal(C, (rest[:, None, None] * z).sum(-3)), rest.sum() * C
+    return -under_forces(C, (rest[:, None, None] * z).sum(-3)), rest.sum() * C
 
 
-def nodal(A: Tensor, F: Tensor) -> Tensor:
-    """A F (..., nodes, 2) of forces on the nodes F (..., nodes, 2)."""
+def under_forces(A: Tensor, F: Tensor) -> Tensor:
+    """Displacements or rates A F (..., nodes, 2) of nodes under forces F (..., nodes, 2), A being
+    their compliance or mobility (2 nodes, 2 nodes)."""
     return (F.flatten(-2) @ A.mT).unflatten(-1, (-1, 2))
 
 

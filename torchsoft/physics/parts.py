@@ -191,7 +191,7 @@ class Integral(nn.Module):
         return self.law(w, w_dot, feed_forward, q, q_dot) + self.Ki * integral, error[..., None]
 
 
-INSTANT = 1e-12
+NO_LAG = 1e-12
 """Time [s] that is added to a lag, so that there may be none."""
 
 
@@ -217,7 +217,7 @@ class Lagging(nn.Module):
     def forward(self, *given: Any) -> tuple[Tensor, Tensor]:
         *seen, z, stage = given
         wanted, rates = respond(self.law, seen, z[..., :-1], stage)
-        rate = (wanted - z[..., -1]) / (self.lag + INSTANT + stage)
+        rate = (wanted - z[..., -1]) / (self.lag + NO_LAG + stage)
         return z[..., -1] + stage * rate, torch.cat((rates, rate[..., None]), -1)
 
 

@@ -182,7 +182,7 @@ def carried_along(rig: Graph, name: str, state: State, u: Tensor) -> Tensor:
     return velocity[:2] + velocity[2] * cross(turned(rig.pads[name].positions + u, pose[2]))
 
 
-def condensed(rig: Graph) -> Graph:
+def with_condensed_pads(rig: Graph) -> Graph:
     """The rig with all pads linear and massless, on their surface alone; itself if they are."""
     if not any(pad.nodal for pad in rig.pads.values()):
         return rig

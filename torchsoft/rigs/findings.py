@@ -15,7 +15,7 @@ from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.motion import hold
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
-from torchsoft.physics.statics import NoEquilibrium, condensed, standing
+from torchsoft.physics.statics import NoEquilibrium, standing, with_condensed_pads
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.geometry import Scene, at
 from torchsoft.rigs.schema import RigTables
@@ -275,7 +275,7 @@ def untied(run: Run) -> Iterator[Diagnostic]:
 def stability(run: Run) -> tuple[Diagnostic | None, float]:
     """A finding on the modes where the contacts carry most, by the growth of one that a loop
     reaches: a disc on the top of a node rolls off it in any case. And the fastest swing [rad/s]."""
-    row, rig, loops = run.loaded(), condensed(run.rig), run.file.loops()
+    row, rig, loops = run.loaded(), with_condensed_pads(run.rig), run.file.loops()
     poses = {name: pose[row].detach() for name, pose in run.trajectory.state.pose.items()}
     still = hold(**{name: float(run.trajectory[name][row]) for name in rig.signals})
     try:

@@ -14,7 +14,7 @@ from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, condensed, standing
+from torchsoft.physics.statics import NoEquilibrium, standing, with_condensed_pads
 from torchsoft.solve.steps import UNITS, own_units
 from torchsoft.solve.trajectory import Trajectory
 
@@ -297,7 +297,7 @@ def instability(rig: Rig, run: Trajectory) -> str:
     grows there, or one does without loops."""
     if not run.force or not rig.actuators:
         return ""
-    soft = condensed(rig)
+    soft = with_condensed_pads(rig)
     least = torch.stack([force.detach()[..., 0].sum(-1) for force in run.force.values()]).amin(0)
     for k in least.argsort(descending=True)[:POSES].tolist():
         try:

@@ -98,7 +98,26 @@ class Room:
 
 
 class Model:
-    """The model of a copy of a rig with parameters `values`, one for each of its structure.
+    """What the structure and the geometry of a rig determine, made of a copy of a rig with
+    parameters `values`, one for each of its structure; fixed from then on.
+
+    rig, structure: that copy and its structure, of which runs take copies of their own
+    layout: places of the parts of the state (size,)
+    recorded: places in the forces (recorded,) of an output, by kind and name
+    integrals: energies [J] that are integrated beside the state
+    signals, followed: names of the reference's signals; their number with fixed coordinates
+    places: places in the vector of parameters, by their names
+    index (m,): places in that vector of the numbers p that the kernels read
+    low, high (parameters,): least and largest values of the parameters, each in its unit
+    derived: numbers made of parameters, as number of a module, name and range; judged: numbers of
+        modules that judge their parameters together
+    errors: components of the state whose error is judged together
+    smallest: size of the smallest body [m]
+    widths: numbers of an output: of the state, of integrals, forces and rates of nodal pads
+    nodal_widths: numbers of rates of each nodal pad
+    bytes: size of the kernels' arrays; no_tape: a tape for nothing
+    shared: whether it may serve other runs
+    last, motion: vectors of parameters and signals of the last run, with what they were made of
 
     Raises the `ValueError`s of a rig that cannot be run, and warns of its laws' faults.
     """
@@ -153,8 +172,6 @@ class Model:
         rig = self.rig
         self.layout, self.integrals, self.signals = rig.layout, integrals(rig), rig.signals
         self.recorded = recorded_slices(rig)
-        slices = self.layout.slices
-        self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
         self.followed = len(rig.signals) + len(rig.fixed_values)
         self.errors = ErrorParts(rig)
         self._known: dict[tuple[int, int], LawSet] = {}
@@ -174,7 +191,7 @@ class Model:
         self._parts = *parts, self._condensed, self._make_nodal(), *self._make_contacts()
         self.bytes = sum(np.asarray(one).nbytes for part in self._parts for one in part)
         self.index = torch.tensor(self._index, dtype=torch.int64)
-        self.nodal = {
+        self.nodal_widths = {
             name: 2 * pad.fields * pad.nodes for name, pad in rig.pads.items() if pad.nodal
         }
         self._chains = [
@@ -303,7 +320,7 @@ class Model:
         pads = [pad if pad.nodal else None for pad in rig.pads.values()]
         dofs = [0 if pad is None else 2 * pad.fields * pad.nodes for pad in pads]
         numbers = [None if pad is None else field_dofs(pad) for pad in pads]
-        band = [0 if dof is None else spread(dof) for dof in numbers]
+        band = [0 if dof is None else bandwidth(dof) for dof in numbers]
         fields = max((pad.fields for pad in rig.pads.values() if pad.nodal), default=1)
         elements = [0 if pad is None else -(-len(pad.corners) // LANES) * LANES for pad in pads]
         laws, starts, ends, density = list[Law | None](), list[int](), list[int](), list[int]()
@@ -469,7 +486,7 @@ def filled_up(rows: Index, width: int) -> Index:
     return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=-1)
 
 
-def spread(corners: Index) -> int:
+def bandwidth(corners: Index) -> int:
     """Largest difference between the dofs of one element, bonded ones (below zero) apart."""
     free = corners >= 0
     most = np.where(free, corners, -1).max(1) - np.where(free, corners, corners.max()).min(1)

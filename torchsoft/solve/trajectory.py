@@ -23,6 +23,7 @@ from torchsoft.solve.gradients import Solved, attached, without_gradient
 from torchsoft.solve.parameters import independent
 from torchsoft.solve.progress import Progress, Stats
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
+from torchsoft.solve.steps import Followed
 
 if TYPE_CHECKING:  # these take as long to import as all of this package
     import pandas as pd
@@ -79,6 +80,7 @@ class Trajectory(Shown):
     rig: Rig | None = None
     _out: Progress
     _stepper: ImplicitStepper
+    _motion: Followed
 
     def __init__(self, **known: Any) -> None:
         """A run all of whose parts are known, as those of one in a file."""
@@ -148,7 +150,7 @@ class Trajectory(Shown):
     @later
     def rates(self) -> dict[str, Tensor]:
         """Rates of the displacements of nodal pads (T, nodes, 2 fields) [m/s]."""
-        widths, pads = self._stepper.parameters.model.nodal, self._stepper.rig.pads
+        widths, pads = self._stepper.parameters.model.nodal_widths, self._stepper.rig.pads
         parts = torch.from_numpy(self._out.rate[: len(self.t)]).split([*widths.values()], -1)
         return {name: x.unflatten(-1, (pads[name].nodes, -1)) for name, x in zip(widths, parts)}
 
@@ -160,7 +162,7 @@ class Trajectory(Shown):
     @later
     def stored_energy(self) -> Tensor:
         """Sum of the stored energies (T,) [J], without a graph."""
-        if self._stepper.parameters.model.nodal:
+        if self._stepper.parameters.model.nodal_widths:
             return sum(self.energy.values(), torch.zeros_like(self.t)).detach()
         return torch.from_numpy(self._out.stored[: len(self.t)])
 
