@@ -30,7 +30,9 @@ Solve = Callable[[Tensor], Tensor]
 
 class Equations(Protocol):
     """Equations whose `residual` (..., n, 2) is to vanish at x (..., n, 2), and their linear
-    solution at x."""
+    solution at x. Where residuals are of another kind than x, steps are judged in their place."""
+
+    like_x: bool
 
     def residual(self, x: Tensor) -> Tensor: ...
 
@@ -41,23 +43,25 @@ class Equations(Protocol):
 def newton(
     equations: Equations, first: Tensor, tolerance: float, iterations: int
 ) -> tuple[Tensor, Solve, float]:
-    """The solution from `first` (..., n, 2) on, the last linear solution, and its largest step.
+    """The solution from `first` (..., n, 2) on, the last linear solution, and the largest residual,
+    or step, that is left.
 
-    A step is halved, sample by sample, until the one after it, by the same linear solution, is
-    shorter. Raises `FloatingPointError` where a matrix is singular.
+    A step is halved, sample by sample, until the residual, or the step after it by the same linear
+    solution, is smaller. Raises `FloatingPointError` where a matrix is singular.
     """
     x, left = first.detach(), np.inf
     r, solve = equations.residual(x), equations.linearised(x)
+    judged = (lambda r: r) if equations.like_x else (lambda r: solve(r))
     for _ in range(iterations):
-        step = solve(r)
-        sizes = step.abs().amax((-2, -1))
+        off = judged(r)
+        sizes = off.abs().amax((-2, -1))
         left, going = float(sizes.max()), sizes > tolerance
         if not bool(going.any()):
             break
-        size, way = step.flatten(-2).norm(dim=-1), step * going[..., None, None]
+        size, way = off.flatten(-2).norm(dim=-1), solve(r) * going[..., None, None]
         for _ in range(HALVINGS):
             r = equations.residual(x + way)
-            worse = going & ~(solve(r).flatten(-2).norm(dim=-1) < size)
+            worse = going & ~(judged(r).flatten(-2).norm(dim=-1) < size)
             if not bool(worse.any()):
                 break
             way = way * torch.where(worse, 0.5, 1.0)[..., None, None]
@@ -86,6 +90,8 @@ class Points:
     """Contact points of a condensed pad at x = N (free + A N^T f(x)) (..., points, 2): A (2 nodes,
     2 nodes) is its compliance or mobility, N (points, nodes) its shape functions, `free` (...,
     nodes, 2) what its nodes do without forces, f a law of contact points."""
+
+    like_x = True
 
     def __init__(self, A: Tensor, N: Tensor, free: Tensor, law: Forces) -> None:
         self.A, self.N, self.free, self.law = A, N, free, law
@@ -123,8 +129,8 @@ def contact_forces(
     first: Tensor | None = None,
 ) -> tuple[Tensor, float]:  # fmt: skip
     """Forces N^T f (..., nodes, 2) [N] of a law at the contact points of a condensed pad (see
-    `Points`), and the largest step that is left; from the forces `first` (..., points, 2) on, by
-    default none."""
+    `Points`), and the largest residual that is left, from the forces `first` (..., points, 2) on,
+    none by default."""
     points = Points(A, N, free, law)
     x, solve, left = newton(
         points, N @ free if first is None else points.moved(first), tolerance, iterations
@@ -206,6 +212,8 @@ def solved(b: Tensor, factors: list[Factor], transposed: bool = False) -> Tensor
 class Nodes:
     """Nodes (..., nodes, 2) of a nodal pad in balance, of the elements' forces `internal` and of
     those of a law of contact points, none by default."""
+
+    like_x = False
 
     def __init__(self, pad: Pad, internal: Forces, law: Forces | None = None) -> None:
         self.pad, self.internal, self.law = pad, internal, law
