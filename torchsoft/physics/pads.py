@@ -94,7 +94,7 @@ class Pad(nn.Module):
         )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
         kept = np.arange(len(mesh.free)) if self.nodal else mesh.surface
-        self.angle, self.mirrored = angle, mirrored
+        self.angle, self.mirrored = float(angle), bool(mirrored)
         c, s = np.cos(angle), np.sin(angle)
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
         self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
