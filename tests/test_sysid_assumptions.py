@@ -18,7 +18,7 @@ from torchsoft.sysid.prediction import Prediction, Readout, Signals, Term, lagge
 from torchsoft.sysid.problem import DIFFERENCE
 from torchsoft.sysid.recording import Grid, extended
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.search import free
+from torchsoft.sysid.search import problem_with
 
 E, MU_K = "materials.rubber.E", "laws.steel_on_rubber.friction.mu_k"
 SENSORS = {"x_C": Sensor(noise=1e-5), "effort_x": Sensor(noise=0.1), "effort_y": Sensor(noise=0.1)}
@@ -223,7 +223,7 @@ def test_a_number_is_free_as_far_as_there_is_a_rig():
     first = strokes()
     data = replace(first, rig=with_value(first, MU_K, 0.795))
     one = suspect(data, MU_K)
-    c = free(Problem([data], SENSORS, {E: Unknown()}), one).coordinates
+    c = problem_with(Problem([data], SENSORS, {E: Unknown()}), one).coordinates
     sliding = next(a for a in c.all if a.name == MU_K)
     reach = AMOUNTS * one.step / one.nominal
     assert sliding.low == pytest.approx((1 - reach) * 0.795)
@@ -236,7 +236,7 @@ def test_amounts_of_alternatives_are_coordinates_with_differences_as_derivatives
     data = strokes()
     problem, runner = Problem([data], SENSORS, {E: Unknown()}), Runner([data])
     one = suspect(data, "height of pads")
-    other = free(problem, one)
+    other = problem_with(problem, one)
     c, which, start = other.coordinates, problem.names, problem.coordinates.start
     assert c.labels == (E, one.name)
     base = problem.residuals(runner, start, which, 1e-4)
@@ -248,7 +248,7 @@ def test_amounts_of_alternatives_are_coordinates_with_differences_as_derivatives
     moved = own.residuals(Runner([thicker]), start, which, base.steps)
     change = at.J[:, 1] * c.all[1].to_x(DIFFERENCE * one.step)
     np.testing.assert_allclose(change, moved.r - base.r, rtol=1e-9, atol=1e-9)
-    assert free(problem, one, held=True).coordinates.free.tolist() == [True, False]
+    assert problem_with(problem, one, held=True).coordinates.free.tolist() == [True, False]
 
 
 def test_an_alternative_of_the_samples_changes_what_is_compared():
@@ -256,7 +256,7 @@ def test_an_alternative_of_the_samples_changes_what_is_compared():
     sensors = {**SENSORS, "y_C": Sensor(noise=1e-5)}
     data = replace(data, samples=data.samples | {"y_C": data.samples["x_C"]})
     problem, runner = Problem([data], sensors, {E: Unknown()}), Runner([data])
-    other = free(problem, suspect(data, "scale of the camera", sensors))
+    other = problem_with(problem, suspect(data, "scale of the camera", sensors))
     c, which = other.coordinates, problem.names
     x = c.with_known({E: problem.coordinates.start[0]})
     at = other.residuals(other.runner(runner), x, which, 1e-3, c.free)

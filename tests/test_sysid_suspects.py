@@ -5,6 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ from torchsoft.sysid.estimate import Quantity
 from torchsoft.sysid.fit import Check
 from torchsoft.sysid.residual_tests import ResidualTest
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.search import best_of
 from torchsoft.sysid.sensitivity import Checked, with_scores
 from torchsoft.sysid.suspects import LIKELY, risk_findings, suspect_findings
 
@@ -123,7 +125,11 @@ def test_nothing_speaks_against_what_is_right(answers):
     trusted, _, whole = answers
     assert whole.verdict == "holds"
     assert {one.severity for one in whole.findings} <= {"note"}
-    assert {one.code for one in whole.findings} <= {"undetectable", "exact", "undetectable-others"}
+    assert {one.code for one in whole.findings} <= {
+        "undetectable",
+        "untestable",
+        "undetectable-others",
+    }
     names = {one.name for one in whole.assumptions}
     assert {
         "mesh", "contact points", "mesh phase", "Coulomb friction",
@@ -209,7 +215,7 @@ def suspect(name: str, gain: float, **more: Any) -> AssumptionTest:
     """A number that a refit finds 5 % off; the sum of squares was 1000."""
     usual: dict[str, Any] = {
         "left": 1000.0 - gain, "favoured": 5.0, "favoured_sd": 0.5, "significance": gain,
-        "value": 1.05, "refitted": True, "passed": True, "moves": {E: 0.4}, "under": {E: 8e5},
+        "value": 1.05, "refitted": True, "passed": True, "moves": {E: 0.08}, "under": {E: 8e5},
     }  # fmt: skip
     stated = f"{name} is 1"
     return AssumptionTest(
@@ -218,39 +224,40 @@ def suspect(name: str, gain: float, **more: Any) -> AssumptionTest:
 
 
 def concluded(tests: list[AssumptionTest], **more: Any) -> Checked:
-    found: dict[str, Any] = {"as_stated": (ALARM,), "sd": {E: 0.004}} | more
+    found: dict[str, Any] = {"fails_as_stated": (ALARM,), "sd": {E: 0.004}} | more
     return Checked(with_scores(tests, 990), np.zeros((1, 0)), np.eye(1), **found)
 
 
 none, a = suspect("c", 0.5, significance=0.5), suspect("a", 300.0)
 linear = partial(suspect, refitted=False)
-LEFT: dict[str, Any] = {"alarms": (ALARM,), "left": (ALARM,)}
+LEFT: dict[str, Any] = {"fails_best": (ALARM,), "fails_besides": (ALARM,)}
 
 
 @pytest.mark.parametrize(
     ("tests", "found", "code", "says"),
     [
-        ([none], {"as_stated": ()}, "", ""),
+        ([none], {"fails_as_stated": ()}, "", ""),
         ([a, none], {}, "cause", "that a is 1: the sum of squares falls by 300 with a = 1.05 "
          f"(+5 % ± 0.5). {E} would move by 0.4 standard deviations; estimates under it: {E} = 8e"),
         ([a, suspect("b", 299.0), suspect("c", 200.0)], {}, "causes",
          "2 assumptions, and cannot tell which: a = 1.05 (+5 % ± 0.5), score 0.56, b = 1.05"),
         ([suspect("b", 300.0, passed=False), suspect("a", 280.0)], {}, "cause", "that a is 1"),
-        ([linear("a", 31.0)], {"as_stated": ()}, "unconfirmed", "most likely a = 1.05 (+5 % ± 0.5)"
-         ": the sum of squares falls by 31, which is more than chance"),
+        ([linear("a", 31.0)], {"fails_as_stated": ()}, "unconfirmed",
+         "most likely a = 1.05 (+5 % ± 0.5): the sum of squares falls by 31, which is more"),
         ([linear("a", 531.0, moves={E: 3.6})], {}, "far",
          f"{E} would move by 18 standard deviations, too far for a score test. Run `torchsoft ex"),
         ([suspect("a", 531.0, under={})], {}, "cause", "refit with a free has not converged"),
         ([a], LEFT, "nearest", "the nearest, a = 1.05 (+5 % ± 0.5), the sum of squares falls by 300"
          ", but residuals still fail a test (correlation with the motion in x of `roll`)"),
         ([linear("a", 300.0)], LEFT, "likeliest", "only a refit can confirm or exclude, is a ="),
-        ([linear("a", 300.0)], LEFT | {"left": (), "besides": (suspect("d", 50.0),)}, "likeliest",
+        ([linear("a", 300.0)], LEFT | {"fails_besides": (), "besides": (suspect("d", 50.0),)},
+         "likeliest",
          "With d also free nothing would be left."),
         ([linear("a", 300.0), linear("b", 250.0)], {}, "rivals",
          "one of 2 assumptions: a = 1.05 (+5 % ± 0.5), b = 1.05"),
         ([none], LEFT | {"searched": True}, "none", "None of the 1 refitted suspects"),
         ([linear("c", 2.0)], LEFT, "no-suspect", "c (0% of the misfit)"),
-        ([linear("c", 2.0)], {"as_stated": ()}, "", ""),
+        ([linear("c", 2.0)], {"fails_as_stated": ()}, "", ""),
     ],
 )  # fmt: skip
 def test_the_conclusion_is_that_of_the_numbers(tests, found, code, says):
@@ -295,17 +302,17 @@ def test_the_largest_undetectable_shift_and_hints_are_named():
         hidden("never", 0.1, 2.0, favoured=-1.5, favoured_sd=0.43, one_sided=True),
     ]  # fmt: skip
     found = {one.code: one for one in risk_findings(concluded(tests))}
-    assert {*found} == {"undetectable", "exact", "undetectable-others", "hinted"}
+    assert {*found} == {"undetectable", "untestable", "undetectable-others", "contradicted"}
     assert all(one.severity == "note" for one in found.values())
     assert f"shift is 6 standard deviations of {E}: a may differ by 3 %" in str(
         found["undetectable"]
     )
-    assert f"{E} depends on far, which no residual can test: 1 % of it" in str(found["exact"])
+    assert f"{E} depends on far, which no residual can test: 1 % of it" in str(found["untestable"])
     assert str(found["undetectable-others"]).endswith(
         "up to 4 standard deviations without being detected: x."
     )
-    assert "stated values of hint = 1.05 (+1.5 % ± 0.43) by three" in str(found["hinted"])
-    assert [one["name"] for one in found["hinted"].facts["cases"]] == ["hint"]
+    assert "stated values of hint = 1.05 (+1.5 % ± 0.43) by three" in str(found["contradicted"])
+    assert [one["name"] for one in found["contradicted"].facts["cases"]] == ["hint"]
     assert not risk_findings(concluded([hidden("b", -0.5, 1.0)]))
 
 
@@ -317,7 +324,7 @@ def test_constants_of_the_computation_widen_intervals_and_are_named():
     mesh = AssumptionTest("mesh", "numerical", "pads have 10 elements", "they had 20",
                           moves={E: 1.5}, favoured_sd=0.8)  # fmt: skip
     lost = replace(mesh, unchecked="a run failed")
-    checked = Checked([mesh, lost], columns, J, late=("b", "c"), sd={E: 0.1, K_N: 0.1})
+    checked = Checked([mesh, lost], columns, J, not_refitted=("b", "c"), sd={E: 0.1, K_N: 0.1})
     np.testing.assert_allclose(checked.covariance(), np.linalg.inv(precision)[:2, :2], rtol=1e-9)
     wide = np.sqrt(np.diag(np.linalg.inv(precision))[0] / np.linalg.inv(J.T @ J)[0, 0])
     assert checked.wider[E] == pytest.approx(wide)
@@ -325,6 +332,25 @@ def test_constants_of_the_computation_widen_intervals_and_are_named():
     assert "so b, c were not refitted" in effort
     assert re.search(rf"{E} depends on .* pads have 10 .* by 1\.5 .* {wide:.2g} times as", moves)
     assert "could not be checked (pads have 10 elements): a run failed" in unknown
+
+
+@pytest.mark.parametrize(
+    ("squares", "kept"),
+    [
+        ([900.0, 800.0, 700.0, 850.0, 750.0, 950.0], "ceb"),  # finalists at least
+        ([500.0 + 40 * k for k in range(12)], "abcd"),  # the best third
+        ([102.0, 400.0, 600.0, 900.0], "ab"),  # half the gain of one that explains the misfit
+        ([120.0, 400.0, 600.0, 900.0], "abc"),  # which this one does not
+    ],
+)
+def test_the_best_of_a_bracket_go_on(squares, kept):
+    end = optimum(ClosedForm(lambda x: [x[0]], 1), 0.0)
+    linear: Any = SimpleNamespace(square=1000.0, dof=100)
+    fits: Any = {
+        name: end._replace(at=end.at._replace(r=np.array([square**0.5])))
+        for name, square in zip("abcdefghijkl", squares)
+    }
+    assert [*best_of(fits, linear)] == [*kept]
 
 
 def estimate(name: str, **more: Any) -> Estimate:

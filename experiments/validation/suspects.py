@@ -20,6 +20,7 @@ cause, and no notice where nothing is wrong. About two hours on two cores for `C
 `DEPARTURES`.
 """
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -179,7 +180,7 @@ def sensor(fault: Callable[[float], Sensing]) -> Sized:
 FRICTION, CENTRE, HEIGHT = ("friction_ratio",), ("bodies.disc.centre",), ("height of", "thickness")
 LATE = ("actuators.lag", "actuators.x.lag", "actuators.y.lag")
 """To first order a delay, a lag and half the period of a hold are the same."""
-SCALE = ("gain x_C", "scale of the camera")
+SCALE = ("gain x_C", "scale of the camera", "scale about the start")
 
 PAIRS: tuple[tuple[str, tuple[str, ...], tuple[float, float], Sized], ...] = (
     ("friction of the upper pad +{} %", FRICTION, (3, 1.5), rig("upper_friction", 0.01, 1.0)),
@@ -206,7 +207,7 @@ PAIRS: tuple[tuple[str, tuple[str, ...], tuple[float, float], Sized], ...] = (
     ("friction falls by {} %", ("drift of laws",), (5, 2.5), rig("wear", 0.01)),
     ("theta through a low-pass of {} Hz", ("lag theta_C",), (20, 40),
      sensor(lambda size: low_passed("theta", size))),
-    ("{} % of effort_y in effort_x", ("crosstalk",), (2, 1),
+    ("{} % of effort_y in effort_x", ("misalignment effort_x",), (2, 1),
      sensor(lambda size: mixed("F_x", "F_y", size / 100))),
     ("camera's scale {}", SCALE, (1.002, 1.001), sensor(lambda size: scaled(size, "zero"))),
     ("camera's scale {} about the begin", SCALE, (1.002, 1.001),
@@ -279,6 +280,7 @@ class Repetition(NamedTuple):
     verdict: str
     notices: list[str]
     unseen: list[str]
+    codes: list[str]
     identify_s: float
     explain_s: float | None
 
@@ -291,6 +293,16 @@ class Repetition(NamedTuple):
         worded = any(word in text for word in case.words for text in self.notices)
         return worded or any(is_right(case, name) for name in self.named)
 
+    def outcome(self, case: Case) -> str:
+        """What is concluded, in one word of `FROZEN`."""
+        if self.false:
+            return "false cause"
+        if {"cause", "causes"} & {*self.codes} or (case.words and self.named_rightly(case)):
+            return "named"
+        if "unconfirmed" in self.codes:
+            return "unconfirmed"
+        return {"does not explain": "none"}.get(self.verdict, self.verdict)
+
     def covered(self, case: Case) -> bool:
         """Whether a reader is told to doubt the estimates, or of what would not be noticed."""
         unseen = any(is_right(case, sentence) for sentence in self.unseen)
@@ -300,9 +312,15 @@ class Repetition(NamedTuple):
         return abs(self.off.get(self.worst, 0.0)) > OFF and not self.covered(case)
 
 
+FROZEN: dict[str, str] = json.loads(
+    (Path(__file__).parents[1] / "results" / "suspects_frozen.json").read_text()
+)["outcomes"]
+"""Outcomes before the search was rewritten: the true cause is "named", perhaps among others;
+something is "unconfirmed", "doubtful", or "none" of the suspects explains it; the model "holds"."""
+
 CAUSES = "cause", "causes", "rivals"
 UNSETTLED = {"rivals", "far", "likeliest", "no-suspect"}
-RISKS = {"undetectable", "exact", "undetectable-others", "hinted"}
+RISKS = {"undetectable", "untestable", "undetectable-others", "contradicted"}
 """Codes of findings: that name causes, that ask for refits, and on what the data would not show."""
 
 
@@ -327,6 +345,7 @@ def summed(case: Case, reps: list[Repetition]) -> dict[str, Any]:
         "worst": [one.off.get(one.worst, 0.0) for one in reps],
         "worst_of": [one.worst for one in reps],
         "verdicts": Counter(one.verdict for one in reps),
+        "outcomes": Counter(one.outcome(case) for one in reps), "frozen": FROZEN.get(case.name, ""),
         "named": sum(one.named_rightly(case) for one in reps),
         "odds": {k: x / len(reps) for k, x in odds.items()},
         "false": sum(bool(one.false) for one in reps),
@@ -352,7 +371,7 @@ def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Rep
     except (Unreachable, ValueError) as error:
         if not case.rejected:
             raise
-        return Repetition({}, {}, [], "rejected", [str(error)], [], 0.0, None)
+        return Repetition({}, {}, [], "rejected", [str(error)], [], [], 0.0, None)
     forget(folder)
     off = {
         e.name: float(np.log(e.value / TRUTH[e.name]) / e.relative_sd)
@@ -363,7 +382,7 @@ def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Rep
     notices = [str(one) for one in result.findings if one.code not in RISKS]
     return Repetition(
         off, named, false_causes(case, result), result.verdict, notices,
-        unseen, identify_s, explain_s,
+        unseen, [one.code for one in result.findings], identify_s, explain_s,
     )  # fmt: skip
 
 
@@ -377,13 +396,14 @@ def table(cases: list[dict[str, Any]]) -> Table:
         rows.append((
             one["name"], f"{one['held']} of {one['of']}",
             f"{min(sizes):.1f} .. {sizes[worst]:.1f} {of}".rstrip(),
-            ", ".join(f"{verdict} ({count})" for verdict, count in one["verdicts"].items()),
+            ", ".join(f"{outcome} ({count})" for outcome, count in one["outcomes"].items()),
+            one["frozen"],
             ", ".join(f"{name} ({x:.2g})" for name, x in odds) or "-",
             f"{one['named']} of {seeds}", one["false"], one["silent"],
             f"{one['identify_s']:.0f}", f"{one['explain_s']:.0f}" if one["explain_s"] else "-",
         ))  # fmt: skip
-    head = ("what differs", "intervals that hold", "worst error / sd", "verdict",
-            "named (mean odds)", "rightly in", "false cause", "silent", "identify [s]",
+    head = ("what differs", "intervals that hold", "worst error / sd", "outcome",
+            "frozen", "named (mean odds)", "rightly in", "false cause", "silent", "identify [s]",
             "explain [s]")  # fmt: skip
     return Table(head, rows)
 

@@ -110,7 +110,7 @@ def with_pads(
 ) -> Recording | None:
     """Replace some pads, also those that parameters of contact laws follow; None where the start is
     a state of the pads as they were."""
-    if not isinstance(recording.start, Standing):
+    if not isinstance(recording.start, Standing) or not {*names} <= {*recording.rig.pads}:
         return None
 
     def change(rig: Rig) -> None:
@@ -126,10 +126,11 @@ def with_pads(
     return with_rig(recording, change)
 
 
-def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
-    """Refine every pad's mesh by the factor `finer`, with other contact points."""
+def remeshed(recording: Recording, finer: int, more: int) -> Recording | None:
+    """Refine every pad's mesh by the factor `finer`, with so many `more` contact points an
+    element."""
     every = tuple(recording.rig.pads)
-    return with_pads(recording, every, lambda pad: pad.remeshed(finer, points))
+    return with_pads(recording, every, lambda pad: pad.remeshed(finer, pad.points + more))
 
 
 def shifted(recording: Recording, part: float) -> Recording:
@@ -178,10 +179,11 @@ def tilted(recording: Recording, angle: float, name: str) -> Recording | None:
     return with_pads(recording, [name], other)
 
 
-def moved(recording: Recording, by: float, body: str) -> Recording:
+def moved(recording: Recording, by: float, body: str) -> Recording | None:
     """Start a body further right by a distance [m]."""
     start = recording.start
-    assert isinstance(start, Standing)
+    if not isinstance(start, Standing) or body not in start.bodies:
+        return None
     (x, *others), velocity = start.bodies[body]
     bodies = {**start.bodies, body: ((x + by, *others), velocity)}
     return replace(recording, start=start._replace(bodies=bodies))
@@ -193,9 +195,9 @@ def off_centre(recording: Recording, by: float, body: str, axis: int) -> Recordi
     Coordinates of the changed rig are those of the centre of mass, and so are the changed samples:
     None without samples of the angle, and with samples of the body's speeds.
     """
-    start, symbol = recording.start, recording.rig.symbols[body]
+    start, symbol = recording.start, recording.rig.symbols.get(body, body)
     turn, speeds = f"theta_{symbol}", (f"v_x_{symbol}", f"v_y_{symbol}")
-    if not isinstance(start, Standing) or turn not in recording.samples:
+    if not isinstance(start, Standing) or turn not in recording.samples or body not in start.bodies:
         return None
     if any(speed in recording.samples for speed in speeds):
         return None
@@ -228,8 +230,10 @@ def rotated(v: Array, angle: Array) -> tuple[Array, Array]:
 # Controllers and set-points
 
 
-def limited(recording: Recording, part: float, name: str, largest: float) -> Recording:
+def limited(recording: Recording, part: float, name: str, largest: float) -> Recording | None:
     """Cut a controller's effort off at a part below its `largest` one [N or N.m]."""
+    if name not in recording.rig.actuators:
+        return None
 
     def change(rig: Rig) -> None:
         rig.actuators[name].limit = parameter(max((1 - part) * largest, LEAST_LIMIT))
@@ -278,7 +282,8 @@ def of_fifth_degree(one: Sampled) -> Sampled:
 
 
 def retimed(recording: Recording, rate: float, shift: float) -> Recording | None:
-    """Evaluate every signal at rate * t + shift [s]; None where one is not piecewise polynomial."""
+    """Let the value of every signal at t come at rate * t + shift [s]; None where one is not
+    piecewise polynomial."""
     signals = signals_of(recording.rig)
     known = {name: one for name, one in signals.items() if isinstance(one, Piecewise)}
     if len(known) < len(signals):

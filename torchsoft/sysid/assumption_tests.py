@@ -52,8 +52,8 @@ class AssumptionTest(Assumption):
     `gain` the fall of the sum of squares, to `left`, at the amount that the data favour: `favoured`
     [unit] with the standard deviation `favoured_sd`. `significance` is the gain over the remaining
     misfit per sample, `pattern` the remaining part of the residuals' autocorrelation, 0 where there
-    is none. With `refitted` the result is that of a converged refit; `dropped` means that a refit
-    was begun and left to others that gained more; else it is a score test. `unchecked` is the
+    is none. With `refitted` the result is that of a refit; `dropped` means that its refit was left
+    to others that gained more, or could not start; else it is a score test. `unchecked` is the
     reason of a missing test. `value` is the favoured value of the `parameter`, `under` are the
     estimates at the favoured amount, by label. `suspected` is whether the data favour the suspect,
     `passed` whether residuals under it pass the tests of a fit, and `score` its share of the
@@ -90,8 +90,8 @@ class AssumptionTest(Assumption):
 
     @property
     def beyond_first_order(self) -> bool:
-        """Whether a parameter of the rig would have to vanish or to double, so that a score test is
-        void."""
+        """Whether a parameter of the rig would have to change by 100 % or more, where a score test
+        means nothing."""
         relative = self.kind == "known" and self.unit == "%" and not self.refitted
         return relative and abs(self.favoured) >= 100
 
@@ -113,8 +113,7 @@ class AssumptionTest(Assumption):
     def shift(self) -> tuple[str, float]:
         """The same at the amount that the data favour."""
         label, move = self.most_moved
-        linear = self.has_amount and not self.refitted
-        return label, move * self.favoured / self.amount if linear else move
+        return label, move * self.favoured / self.amount if self.has_amount else move
 
     @property
     def impact(self) -> tuple[str, float, float]:
@@ -165,9 +164,12 @@ class Linearised:
         least = 1e-12 if Q is self.Q else REDUNDANT
         if size < least * float(d @ d) or size == 0.0:
             return self.outcome(one, moves, 0.0, square, 0.0, float("inf"), r, r)
-        gain, amounts = along**2 / size, -along / size
+        favoured = -along / size * one.amount
         sd = (max(1.0, square / self.dof) / size) ** 0.5 * one.amount
-        after, favoured = r + amounts * part, amounts * one.amount
+        amounts = -along / size if one.has_amount else 1.0
+        amounts = max(amounts, 0.0) if one.one_sided else amounts
+        after = r + amounts * part
+        gain = max(square - float(after @ after), 0.0)
         test = self.outcome(one, moves, gain, square - gain, favoured, sd, after, r)
         x = self.end.x[self.end.free] + amounts * moves * self.sd
         return replace(test, detectable=EVIDENT**0.5 * sd, under=self.values(x))
@@ -182,15 +184,17 @@ class Linearised:
             c, x = fit.coordinates[k], fit.by_label[one.label]
             per_step = one.amount / one.step
             favoured = (c.to_value(x) - one.nominal) * per_step
-            sd = rest**0.5 * float(fit.sd[k]) * c.slope(x) * per_step
+            sd = rest**0.5 * float(fit.sd[k]) * c.slope(x) * abs(per_step)
         x = np.array([fit.by_label[label] for label in self.labels])
         moves = (x - self.end.x[self.end.free]) / self.sd
+        if one.has_amount and favoured != 0.0:
+            moves = moves * one.amount / favoured
         test = self.outcome(
             one, moves, gain, left, favoured, sd, fit.at.r, self.r, refitted=True,
             under=self.values(x) if fit.converged else {},
             passed=not self.alarms(fit.at.r, fit.J),
         )  # fmt: skip
-        return replace(test, amount=score.amount, step=score.step, detectable=score.detectable)
+        return replace(test, detectable=score.detectable)
 
     def values(self, x: Array) -> dict[str, float]:
         """Fitted coordinates x (n,) in physical units, by label."""

@@ -142,19 +142,19 @@ class Suspect(Assumption):
         return self.parameter or self.name
 
 
-def number(
+def by_amount(
     name: str, stated: str, otherwise: str, step: float, per_unit: float, unit: str,
     change: Callable[..., Recording | None], **more: Any,
 ) -> Suspect:  # fmt: skip
-    """An alternative by an amount of `step` [SI], shown in a unit, of which there are `per_unit` in
-    an SI unit."""
+    """An alternative by an amount: `step` in SI units is shown as `per_unit` times that in the
+    `unit`."""
     kind: Kind = more.pop("kind", "known")
     return Suspect(
         name, kind, stated, otherwise, per_unit * step, unit, step=step, change=change, **more
     )
 
 
-def whole(
+def either_or(
     name: str, kind: Kind, stated: str, otherwise: str,
     change: Callable[[Recording], Recording | None], **more: Any,
 ) -> Suspect:  # fmt: skip
@@ -188,20 +188,20 @@ def numerical(recording: Recording) -> Iterator[Suspect]:
     pad = next(iter(recording.rig.pads.values()))
     nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
     at = f"{points} points an element" if points else "on the nodes"
-    yield whole(
+    yield either_or(
         "mesh", "numerical", f"the pads have {nx} x {ny} elements",
-        f"they had {2 * nx} x {2 * ny}", lambda r: remeshed(r, 2, points),
+        f"they had {2 * nx} x {2 * ny}", lambda r: remeshed(r, 2, 0),
     )  # fmt: skip
-    yield whole(
+    yield either_or(
         "contact points", "numerical", f"contact is computed {at}",
-        f"it were at {points + 2} points an element", lambda r: remeshed(r, 1, points + 2),
+        f"it were at {points + 2} points an element", lambda r: remeshed(r, 1, 2),
     )  # fmt: skip
-    yield whole(
+    yield either_or(
         "mesh phase", "numerical", "a node lies where the mesh puts it",
         "nodes lay a quarter of an element on", lambda r: shifted(r, 0.25),
     )  # fmt: skip
     if any(isinstance(one, Sampled) for one in recording.rig.reference.signals.values()):
-        yield whole(
+        yield either_or(
             "set-points", "numerical", "set-points lie on a smooth curve through the recorded ones",
             "the curve between them were of fifth degree", smoother,
         )  # fmt: skip
@@ -209,16 +209,16 @@ def numerical(recording: Recording) -> Iterator[Suspect]:
 
 def of_motion(recording: Recording) -> Iterator[Suspect]:
     """Clock of the set-points, and what is fed forward."""
-    yield number(
+    yield by_amount(
         "clock of the set-points", "set-points and sensors have one clock", "set-points came later",
         CLOCK, MILLI, "ms", delayed,
     )  # fmt: skip
-    yield number(
+    yield by_amount(
         "scale of the clock", "clocks of set-points and sensors run equally fast",
         "that of the set-points ran slower", SLOWER, PERCENT, "%", stretched,
     )  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in recording.rig.actuators.values()):
-        yield number(
+        yield by_amount(
             "feed-forward", "the feed-forward is known", f"it were {FORCE} N more", FORCE, 1.0, "N",
             raised,
         )  # fmt: skip
@@ -228,17 +228,17 @@ def of_laws(recording: Recording) -> Iterator[Suspect]:
     """Laws that hold or do not."""
     if isinstance(recording.start, Standing):
         lead, other = recording.start.lead, 0.0 if recording.start.lead else SETTLE
-        yield whole(
+        yield either_or(
             "lead", "law", f"bodies were placed {lead:g} s before the first sample (lead)",
             f"it were {other:g} s", lambda r: led(r, other),
         )  # fmt: skip
     if any(isinstance(law.friction, SmoothSlip) for law in laws(recording.rig)):
-        yield whole(
+        yield either_or(
             "Coulomb friction", "law", 'slip is smooth (friction "smooth")', "it were Coulomb's",
             coulomb,
         )  # fmt: skip
     if linear_pads(recording.rig):
-        yield whole(
+        yield either_or(
             "finite strain", "law", "pads are linear", "they were neo-Hookean", at_finite_strain,
             costly=True,
         )  # fmt: skip
@@ -251,7 +251,7 @@ def of_bodies(recording: Recording, unknown: Collection[str]) -> Iterator[Suspec
     standing = isinstance(recording.start, Standing)
     for name, axes in rig.layout.free.items():
         if standing and 0 in axes and not {f"{name}.x", f"start.{name}.x"} & {*pushed, *unknown}:
-            yield number(
+            yield by_amount(
                 f"start of {name}.x", f"{name} starts where the start states",
                 f"it started {MICRO * PLACE:g} um further right", PLACE, MICRO, "um",
                 partial(moved, body=name),
@@ -260,7 +260,7 @@ def of_bodies(recording: Recording, unknown: Collection[str]) -> Iterator[Suspec
         if axes != [0, 1, 2] or rig.bodies[name].shape is None or driven or not standing:
             continue
         for k, axis in enumerate("xy"):
-            yield number(
+            yield by_amount(
                 f"bodies.{name}.centre_{axis}",
                 f"the centre of mass of {name} is where it is stated",
                 f"it were {MILLI * CENTRE:g} mm off along {axis}", CENTRE, MILLI, "mm",
@@ -276,17 +276,17 @@ def of_pads(recording: Recording) -> Iterator[Suspect]:
     for names in (*groups, *([name] for name in blocks)):
         who = "pads" if len(names) > 1 else f"the pad {names[0]}"
         for extent, size, stays in (("height", KNOWN, "face"), ("length", LENGTH, "first end")):
-            yield number(
+            yield by_amount(
                 f"{extent} of {who}", f"the {extent} of {who} is as stated",
                 f"it were more, each {stays} being where it is", size, PERCENT, "%",
                 partial(resized, names=names, extent=extent),
             )  # fmt: skip
     for name in pads:
-        yield number(
+        yield by_amount(
             f"place of the pad {name}", f"the face of the pad {name} is where it is stated",
             "it were nearer to what touches it", PLACE, MICRO, "um", partial(lifted, name=name),
         )  # fmt: skip
-        yield number(
+        yield by_amount(
             f"tilt of the pad {name}", f"the pad {name} lies at the angle stated",
             "it were turned anticlockwise", TILT, MILLI, "mrad", partial(tilted, name=name),
         )  # fmt: skip
@@ -296,7 +296,7 @@ def of_controllers(recording: Recording, efforts: Mapping[str, float]) -> Iterat
     """Limits of controllers."""
     for name, one in recording.rig.actuators.items():
         if isinstance(undelayed(one), PD) and one.limit is None and efforts.get(name, 0.0) > 0.0:
-            yield number(
+            yield by_amount(
                 f"limit of the controller {name}", f"the controller {name} does not saturate",
                 f"it were cut off below {efforts[name]:.3g}, its largest effort", CUT, PERCENT, "%",
                 partial(limited, name=name, largest=efforts[name]), one_sided=True,
@@ -306,16 +306,18 @@ def of_controllers(recording: Recording, efforts: Mapping[str, float]) -> Iterat
 def of_parameters(recordings: Sequence[Recording], unknown: Collection[str]) -> Iterator[Suspect]:
     """Parameters of the rig that are known, and not zero."""
     for name, value in recordings[0].parameters.items():
-        if name in unknown or value == 0.0 or name.startswith("start.") or "fixed" in name:
+        if name in unknown or value == 0.0 or name.startswith("start.") or ".fixed." in name:
+            continue
+        if any(name not in r.parameters for r in recordings):
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
-        if all(r.parameters.get(name) == value for r in recordings):
+        if all(r.parameters[name] == value for r in recordings):
             yield Suspect(
                 name, "known", f"{name} is {value:.6g}", f"{name} were {(1 + part) * value:.6g}",
                 PERCENT * part, "%", parameter=name, nominal=value, step=part * value,
             )  # fmt: skip
         else:
-            yield number(
+            yield by_amount(
                 name, f"{name} is as each recording states it", f"{name} were larger", part,
                 PERCENT, "%", partial(scaled, name=name),
             )  # fmt: skip
@@ -359,7 +361,7 @@ def of_cameras(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[
     places = [channel for channel in sensors if recording.units.get(channel) == "m"]
     if len(places) > 1:
         for name, about in (("scale", "zero"), ("scale about the start", "their first sample")):
-            yield number(
+            yield by_amount(
                 f"{name} of the camera", f"{', '.join(places)} have one true scale",
                 f"they were all too large about {about}", ZOOM, PERCENT, "%",
                 partial(zoomed, channels=places, about_start=about != "zero"), kind="sensor",
@@ -368,7 +370,7 @@ def of_cameras(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[
     for body, symbol in recording.rig.symbols.items():
         pair = f"x_{symbol}", f"y_{symbol}"
         if {*pair} <= {*places}:
-            yield number(
+            yield by_amount(
                 f"angle of the camera on {body}",
                 f"{pair[0]} and {pair[1]} are along the axes of the rig",
                 "their camera were turned anticlockwise about its own axis", TILT, MILLI, "mrad",

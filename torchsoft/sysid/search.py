@@ -30,9 +30,10 @@ from torchsoft.tables import plain
 BRACKET, FINALISTS = 16, 3
 """Suspects of a bracket, and those of it that are fitted until they converge."""
 
-FAR = 2.0
-"""Misfit per sample above which score tests order suspects wrongly, so that the first
-bracket has all of them but costly ones."""
+FAINT = 0.01
+"""Part of the misfit above the noise that a suspect explains by its score test to be in the first
+bracket, however large that is: far from the data score tests order suspects wrongly, and causes had
+0.16 and more."""
 
 KEPT = 3
 """One in so many suspects goes on after a round, with so many times as many evaluations."""
@@ -44,8 +45,8 @@ TIGHTENINGS = 2
 """Most times that a finalist goes on with a tenth of its tolerance."""
 
 COMPARABLE = 2 * EVIDENT
-"""Sum of squares that a finalist may leave beyond the best one and still go on until it has
-converged: what is evident, and as much for the steps of the fit, which are not its own."""
+"""A finalist that leaves more than this beyond the best one is stopped: `EVIDENT`, and as much for
+the error of its steps."""
 
 PARTS = (1.0, 0.25, 0.0625)
 """Parts of the first step that are tested."""
@@ -66,7 +67,7 @@ HALVINGS = 10
 # A suspect becomes free
 
 
-def free(problem: Problem, one: Suspect, held: bool = False) -> Problem:
+def problem_with(problem: Problem, one: Suspect, held: bool = False) -> Problem:
     """The problem with the coordinate of a suspect, which is free unless `held`; that of an
     alternative that holds or does not is held always. Raises `ValueError` where it cannot be."""
     unknowns, sensors, fixed = dict(problem.unknowns), dict(problem.sensors), set(problem.held)
@@ -105,10 +106,10 @@ def farthest(recordings: Sequence[Recording], name: str, value: float, part: flo
     raise ValueError(f"{name} = {value:g} can hardly be varied")
 
 
-def opened(end: Fit, one: Suspect) -> Fit:
+def fit_with(end: Fit, one: Suspect) -> Fit:
     """The fit with a suspect free, at its end and at the suspect's neutral value; an alternative
     that holds or does not is in force. Raises `ValueError` for one that cannot be free."""
-    problem = free(end.problem, one)
+    problem = problem_with(end.problem, one)
     c = problem.coordinates
     x, i = c.with_known(end.by_label), c.labels.index(one.label)
     x[i] = c.all[i].to_x(one.nominal if one.has_amount else 1.0)
@@ -140,11 +141,11 @@ Column = tuple[Suspect, Array | None, str]
 
 def exact_columns(end: Fit, some: Sequence[Suspect]) -> tuple[list[Column], Array | None]:
     """Columns of suspects that are coordinates, and the Jacobian (m, n) of the fitted coordinates,
-    from one run of each recording. Empty where it fails."""
+    from one run of each recording."""
     out, wide, mine = list[Column](), end.problem, list[Suspect]()
     for one in (one for one in some if one.change is None):
         try:
-            wide = free(wide, one, held=True)
+            wide = problem_with(wide, one, held=True)
             mine.append(one)
         except ValueError as error:
             out.append((one, None, str(error)))
@@ -153,7 +154,7 @@ def exact_columns(end: Fit, some: Sequence[Suspect]) -> tuple[list[Column], Arra
     x = c.with_known(end.by_label)
     at = wide.residuals(wide.runner(end.runner), x, end.which, end.at.steps, names)
     if at.failed:
-        return [], None
+        return [*out, *((one, None, at.reason) for one in mine)], None
     for one in mine:
         i = c.labels.index(one.label)
         out.append((one, at.J[:, i] * (one.step / c.all[i].slope(x[i])), ""))
@@ -165,7 +166,10 @@ def difference_column(end: Fit, one: Suspect) -> Column:
     either sign is by a part of its amount: coordinates take most of an effect, and what its
     curvature leaves must not hide the rest."""
     part = DIFFERENCE if one.has_amount and not one.one_sided else 1.0
-    problem = free(end.problem, one, held=True)
+    try:
+        problem = problem_with(end.problem, one, held=True)
+    except ValueError as error:
+        return one, None, str(error)
     c = problem.coordinates
     x, i = c.with_known(end.by_label), c.labels.index(one.label)
     x[i] = c.all[i].to_x(part * one.step)
@@ -191,7 +195,8 @@ def search(
     bar = tqdm(total=len(queue), unit="suspect", disable=hidden(end.progress))
     with bar, warnings.catch_warnings(action="ignore"):
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
-        size = sum(not one.costly for one in queue) if end.chi2 > FAR else BRACKET
+        least = max(EVIDENT, FAINT * (linear.square - linear.dof))
+        size = max(BRACKET, sum(tests[one.name].gain >= least for one in queue if not one.costly))
         while queue and end.runner.work < most:
             bracket, queue = queue[:size], queue[size:]
             fits, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
@@ -205,7 +210,7 @@ def search(
             best, explained = np.inf, False
             for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
                 bar.set_description(plain(f"refit with {one.name} free"))
-                refit = finished(fits[one].by(end.rtol), best + COMPARABLE)
+                refit = completed(fits[one].by(end.rtol), best + COMPARABLE)
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
                 best = min(best, refit.square)
@@ -232,7 +237,7 @@ def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised)
     """The fit with a suspect free after the step that its score test predicts, or the best of some
     parts of it, at the tolerance `LOOSE`; None where it cannot be simulated."""
     try:
-        start = opened(end, one.within(test.favoured)).by(max(LOOSE, end.rtol))
+        start = fit_with(end, one.within(test.favoured)).by(max(LOOSE, end.rtol))
     except ValueError:
         return None
     c, step = start.problem.coordinates, np.zeros(len(start.x))
@@ -261,7 +266,7 @@ def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
     ranked = sorted(fits, key=lambda one: fits[one].square)
     kept = ranked[: max(len(ranked) // KEPT, FINALISTS)]
     gains = {one: linear.square - fits[one].square for one in kept}
-    if gains[kept[0]] < NEARLY * (linear.square - linear.dof):
+    if gains[kept[0]] < max(NEARLY * (linear.square - linear.dof), EVIDENT):
         return kept
     return [one for one in kept if gains[one] >= RIVAL * gains[kept[0]]]
 
@@ -273,7 +278,7 @@ def carried_on(fit: Fit, evaluations: int) -> Fit:
     return fit
 
 
-def finished(fit: Fit, most: float = np.inf) -> Fit:
+def completed(fit: Fit, most: float = np.inf) -> Fit:
     """The fit, continued until it converges, with ratios at a bound scanned over their whole range;
     on fine steps where it leaves at most `most` of the sum of squares."""
     c = fit.problem.coordinates

@@ -41,15 +41,15 @@ class Checked(NamedTuple):
     """Whether suspects were refitted."""
     untried: tuple[str, ...] = ()
     """Tests left out by an interruption."""
-    late: tuple[str, ...] = ()
+    not_refitted: tuple[str, ...] = ()
     """Suspects that were not refitted, since the others took all of the effort."""
     besides: tuple[AssumptionTest, ...] = ()
     """Effects that the data favour besides the likeliest suspect, each beside those before it."""
-    as_stated: tuple[ResidualTest, ...] = ()
+    fails_as_stated: tuple[ResidualTest, ...] = ()
     """Tests that the residuals of the fit fail."""
-    alarms: tuple[ResidualTest, ...] = ()
+    fails_best: tuple[ResidualTest, ...] = ()
     """Tests that residuals under the likeliest suspect fail."""
-    left: tuple[ResidualTest, ...] = ()
+    fails_besides: tuple[ResidualTest, ...] = ()
     """Tests that they fail with the effects besides also free."""
     sd: Mapping[str, float] = MappingProxyType({})
     """Standard deviations of the free coordinates, by label."""
@@ -64,7 +64,7 @@ class Checked(NamedTuple):
     def explained(self) -> bool:
         """Whether nothing is left under the likeliest suspect alone, and without it something
         is."""
-        return bool(self.favoured and self.as_stated) and not self.alarms
+        return bool(self.favoured and self.fails_as_stated) and not self.fails_best
 
     @property
     def wider(self) -> dict[str, float]:
@@ -101,15 +101,17 @@ def check_assumptions(end: Fit, *, doubtful: bool = False, effort: float = 0.0) 
         linear.J,
         searched=bool(refits.fits),
         untried=scored.untried + refits.untried,
-        late=() if any(one.refitted and one.passed for one in tests) else refits.late,
-        as_stated=tuple(linear.alarms(linear.r, linear.J)),
+        not_refitted=()
+        if any(c.refitted and c.suspected and c.passed for c in tests)
+        else refits.left,
+        fails_as_stated=tuple(linear.alarms(linear.r, linear.J)),
         sd=dict(zip(linear.labels, linear.sd.tolist())),
     )
     if not done.favoured:
-        return done._replace(alarms=done.as_stated)
+        return done._replace(fails_best=done.fails_as_stated)
     best = done.favoured[0]
     besides, alone, left = linear.besides(best, refits.fits.get(best.name), scored.columns)
-    return done._replace(besides=tuple(besides), alarms=tuple(alone), left=tuple(left))
+    return done._replace(besides=tuple(besides), fails_best=tuple(alone), fails_besides=tuple(left))
 
 
 class Scored(NamedTuple):
@@ -148,7 +150,7 @@ class Refits(NamedTuple):
 
     tests: dict[str, AssumptionTest]
     fits: Mapping[str, Fit] = MappingProxyType({})
-    late: tuple[str, ...] = ()
+    left: tuple[str, ...] = ()
     untried: tuple[str, ...] = ()
 
 
@@ -164,7 +166,7 @@ def refitted(end: Fit, scored: Scored, effort: float) -> Refits:
             fits |= {} if fit is None else {test.name: fit}
     except KeyboardInterrupt:
         return Refits(tests, fits, untried=tuple(f"a refit with {name} free" for name in left))
-    return Refits(tests, fits, late=tuple(left))
+    return Refits(tests, fits, tuple(left))
 
 
 def suspects_of(end: Fit) -> list[Suspect]:

@@ -189,7 +189,7 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "The largest undetectable shift is {shift:.2g} standard deviations of {estimate}: {name} "
         "may differ by {size} from its stated value, and the data would not show it.",
     ),
-    "exact": (
+    "untestable": (
         "{estimate} depends on {name}, which no residual can test: {size} of it is {shift:.2g} "
         "standard deviations.",
     ),
@@ -197,7 +197,7 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "{count} more would shift an estimate by up to {shift:.2g} standard deviations without "
         "being detected: {names}.",
     ),
-    "hinted": (
+    "contradicted": (
         "The data contradict the stated values of {cases} by three standard deviations or more.",
         "That may be chance: {tested} assumptions were tested.",
     ),

@@ -42,12 +42,12 @@ def suspect_findings(checked: Checked, unexplained: Severity) -> list[Finding]:
     best, *others = checked.favoured
     facts: dict[str, Any] = {"cases": [best.case], "gain": best.gain}
     estimate, shift = best.shift
-    if not checked.as_stated:
+    if not checked.fails_as_stated:
         facts["others"] = [one.name for one in others if one.score > LIKELY]
         return [Finding("unconfirmed", "error", facts)]
-    if checked.alarms:
+    if checked.fails_best:
         facts |= {"alarms": alarms_of(checked)}
-        if not checked.left:
+        if not checked.fails_besides:
             facts["besides"] = [one.name for one in checked.besides]
         return [Finding("nearest" if best.refitted else "likeliest", "error", facts)]
     rivals = [one for one in checked.checks if one.suspected and one.gain > RIVAL * best.gain]
@@ -82,12 +82,12 @@ def causes(likely: Sequence[AssumptionTest]) -> Finding:
 def without_suspect(checked: Checked, severity: Severity) -> list[Finding]:
     """A finding where the data favour no suspect, and residuals fail a test."""
     refitted = [one for one in checked.checks if one.refitted]
-    if checked.alarms and not checked.searched:
+    if checked.fails_best and not checked.searched:
         nearest = sorted(checked.checks, key=lambda one: -one.gain)[:NEAREST]
         square = max((one.left + one.gain for one in checked.checks), default=1.0)
         cases = [{"name": one.name, "part": one.gain / square} for one in nearest]
         return [Finding("no-suspect", severity, {"cases": cases})]
-    if checked.alarms:
+    if checked.fails_best:
         facts = {"count": len(refitted), "alarms": alarms_of(checked)}
         return [Finding("none", severity, facts)]
     return []
@@ -95,7 +95,7 @@ def without_suspect(checked: Checked, severity: Severity) -> list[Finding]:
 
 def alarms_of(checked: Checked) -> list[dict[str, Any]]:
     """Tests that residuals under the likeliest suspect fail, as cases."""
-    return [{"test": TESTS[one.test]} | one.case for one in checked.alarms]
+    return [{"test": TESTS[one.test]} | one.case for one in checked.fails_best]
 
 
 def between(some: Sequence[AssumptionTest]) -> dict[str, list[float]]:
@@ -115,8 +115,8 @@ def test_findings(checked: Checked) -> list[Finding]:
     out, checks = list[Finding](), checked.checks
     if checked.untried:
         out.append(Finding("interrupted", "note", {"names": [*checked.untried]}))
-    if checked.late:
-        out.append(Finding("effort", "note", {"names": [*checked.late]}))
+    if checked.not_refitted:
+        out.append(Finding("effort", "note", {"names": [*checked.not_refitted]}))
     moved_on = any(c.refitted and c.suspected for c in checks)  # to another end than the fit's
     for c in (c for c in checks if c.kind == "numerical"):
         estimate, shift = c.most_moved
@@ -143,16 +143,16 @@ def risk_findings(checked: Checked) -> list[Finding]:
     hidden.sort(key=lambda c: -abs(c.impact[1]))
     exact.sort(key=lambda c: -abs(c.most_moved[1]))
     out = [risk("undetectable", c, *c.impact) for c in hidden[:1]]
-    out += [risk("exact", c, *c.most_moved, c.amount) for c in exact[:1]]
+    out += [risk("untestable", c, *c.most_moved, c.amount) for c in exact[:1]]
     if more := [c for c in hidden[1:] if abs(c.impact[1]) >= CONTRADICTED]:
         facts: dict[str, Any] = {"count": len(more), "shift": abs(more[0].impact[1])}
         out.append(
             Finding("undetectable-others", "note", facts | {"names": [c.name for c in more]})
         )
     contradicted = [c for c in measured if abs(c.favoured) > CONTRADICTED * c.favoured_sd]
-    if hinted := [c for c in contradicted if c.favoured > 0 or not c.one_sided]:
-        facts = {"cases": [c.case for c in hinted], "tested": len(measured)}
-        out.append(Finding("hinted", "note", facts))
+    if evident := [c for c in contradicted if c.favoured > 0 or not c.one_sided]:
+        facts = {"cases": [c.case for c in evident], "tested": len(measured)}
+        out.append(Finding("contradicted", "note", facts))
     return out
 
 
