@@ -29,7 +29,7 @@ FLOWS = {
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",
     "solve": """
-        kernel laws steps progress model system stepper trajectory gradients formats
+        kernel laws steps progress model parameters stepper gradients trajectory netcdf vtk mcap
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """

@@ -80,7 +80,7 @@ def first_stage(name: str) -> Stage:
     stepper, t = ImplicitStepper(rig, step=STEP), times(10 * STEP, 2)
     with torch.no_grad():
         [*stepper.integrate(random_state(rig, 3), t, segments, float("inf"))]
-    rig, size = stepper.compiled.system, stepper.layout.size
+    rig, size = stepper.parameters.system, stepper.layout.size
     work = scratch("Work", rig, size, columns=2)
     return Stage(rig, work, segments[-1].tapes, segments[-1].stages, size)
 

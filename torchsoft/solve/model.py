@@ -16,16 +16,17 @@ from torch import Tensor
 
 from torchsoft.caller import warn
 from torchsoft.codegen import Law
+from torchsoft.physics.channels import recorded_slices
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.elements import Quadrilateral
-from torchsoft.physics.energy import Integrals
+from torchsoft.physics.energy import integrals
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
-from torchsoft.physics.structure import Copies, Structure, structure_of
+from torchsoft.physics.structure import Structure, structure_of
 from torchsoft.physics.validity import (
     LARGEST,
     MISSING,
@@ -75,9 +76,6 @@ HELD = 3e-4
 """Strain up to which the derivatives of an element's forces are held while it changes, in Newton's
 method."""
 
-NEGLIGIBLE = 1e-9
-"""Nodal force [N] below which a node counts as unloaded."""
-
 KEPT, KEPT_BYTES = 8, 5e7
 """Most models that are kept, and arrays of theirs [bytes] beyond the last one's."""
 
@@ -100,15 +98,34 @@ class Room:
 
 
 class Model:
-    """The model of a copy of a rig with parameters `values`, one for each of its structure.
+    """What the structure and the geometry of a rig determine, made of a copy of a rig with
+    parameters `values`, one for each of its structure; fixed from then on.
+
+    rig, structure: that copy and its structure, of which runs take copies of their own
+    layout: places of the parts of the state (size,)
+    recorded: places in the forces (recorded,) of an output, by kind and name
+    integrals: energies [J] that are integrated beside the state
+    signals, followed: names of the reference's signals; their number with fixed coordinates
+    places: places in the vector of parameters, by their names
+    index (m,): places in that vector of the numbers p that the kernels read
+    low, high (parameters,): least and largest values of the parameters, each in its unit
+    derived: numbers made of parameters, as number of a module, name and range; judged: numbers of
+        modules that judge their parameters together
+    errors: components of the state whose error is judged together
+    smallest: size of the smallest body [m]
+    widths: numbers of an output: of the state, of integrals, forces and rates of nodal pads
+    nodal_widths: numbers of rates of each nodal pad
+    bytes: size of the kernels' arrays; no_tape: a tape for nothing
+    shared: whether it may serve other runs
+    last, motion: vectors of parameters and signals of the last run, with what they were made of
 
     Raises the `ValueError`s of a rig that cannot be run, and warns of its laws' faults.
     """
 
     def __init__(self, structure: Structure, values: Sequence[Tensor]) -> None:
-        self.copies = Copies(structure)
-        modules = self.copies.made(values)
+        modules = structure.copy(values)
         self.rig: Rig = modules[0]
+        self.structure = Structure(self.rig)
         self.rig.check_names()
         check_values(self.rig)
         check_groups(self.rig)
@@ -120,7 +137,7 @@ class Model:
         self._geometry = self._geometry_of(values)
         self._read(values)
         self._idle: list[Room] = []
-        self.last: tuple[Array, Tensor, dict[str, float]] | None = None
+        self.last: tuple[Array, Tensor, Tensor, dict[str, float]] | None = None
         self.motion: tuple[Any, Followed] | None = None
 
     def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
@@ -153,9 +170,8 @@ class Model:
 
     def _read(self, values: Sequence[Tensor]) -> None:
         rig = self.rig
-        self.layout, self.integrals, self.signals = rig.layout, Integrals(rig), rig.signals
-        slices = self.layout.slices
-        self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
+        self.layout, self.integrals, self.signals = rig.layout, integrals(rig), rig.signals
+        self.recorded = recorded_slices(rig)
         self.followed = len(rig.signals) + len(rig.fixed_values)
         self.errors = ErrorParts(rig)
         self._known: dict[tuple[int, int], LawSet] = {}
@@ -167,6 +183,7 @@ class Model:
         for value in (*values, *self._made.values()):
             self._places.setdefault(id(value), count)
             count += value.numel()
+        self.places = self._named_places()
         self._bodies = self._make_bodies()
         self._pads = self._make_pads()
         parts = (
@@ -176,11 +193,9 @@ class Model:
         self._parts = *parts, self._condensed, self._make_nodal(), *self._make_contacts()
         self.bytes = sum(np.asarray(one).nbytes for part in self._parts for one in part)
         self.index = torch.tensor(self._index, dtype=torch.int64)
-        self.nodal = {
+        self.nodal_widths = {
             name: 2 * pad.fields * pad.nodes for name, pad in rig.pads.items() if pad.nodal
         }
-        points = [2 * count for count in rig.point_counts.values()]
-        self.felt = [*points, 3 * len(rig.pads), 3 * len(rig.bodies) + 3]
         self._chains = [
             (at, n) for at, n in zip(self._condensed.chain_at, self._condensed.branches) if n
         ]
@@ -189,24 +204,19 @@ class Model:
         none = self.system(np.zeros(len(self._index)))
         self.no_tape = scratch("Tape", none, self.layout.size, stages=0, cap=0)
         self.widths = (
-            self.layout.size, len(self.integrals.names), recorded_size(none),
+            self.layout.size, len(rig.pads) + len(rig.actuators) + len(rig.bodies) + 4,
+            recorded_size(none),
             int(none.nodal_dof_start[-1]),
         )  # fmt: skip
         del self._made, self._places, self._shapes, self._matched, self._known, self._index
 
-    def displaced(self, p: Array, y: Array) -> dict[str, float]:
-        """Largest displacements of the loaded nodes of condensed pads [m] in states y (T, size)."""
-        own, out = self._condensed, dict[str, float]()
-        for name, here in self.condensed.items():
-            i = [*self.rig.pads].index(name)
-            at, n = own.chain_at[i], own.branches[i]
-            zeta = p[at : at + n] @ y[:, here].reshape(len(y), n, -1)
-            loaded = np.flatnonzero(np.abs(zeta).max(0) > NEGLIGIBLE) // 2 * 2
-            span = slice(*loaded[[0, -1]] + [0, 2]) if len(loaded) else slice(0)
-            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(2 * (zeta.shape[1:]))
-            u = p[at + 2 * n] * (zeta[:, span] @ C[span, span])
-            out[name] = float(np.sqrt((u.reshape(len(y), -1, 2) ** 2).sum(-1).max(initial=0.0)))
-        return out
+    def _named_places(self) -> dict[str, slice]:
+        """Places of the parameters by all of their names, and of what is computed from them."""
+        named = dict(self.rig.named_parameters(remove_duplicate=False))
+        named |= {name: named[own] for name, own in self.rig.names.items() if own in named}
+        named |= {f"{kind} of {part}": value for (kind, part), value in self._made.items()}
+        firsts = {name: self._places[id(value)] for name, value in named.items()}
+        return {name: slice(at, at + named[name].numel()) for name, at in firsts.items()}
 
     def system(self, p: Array) -> Any:
         """The rig's arrays with the vector of parameters p."""
