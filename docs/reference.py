@@ -285,7 +285,7 @@ def channels() -> str:
         ]  # fmt: skip
         text += [f"## Of the rig `{name}`", grid(("channel", "unit", "meaning", "sensor"), rows)]
         single = [
-            (f"`{key}`", unit) for key, (unit, _) in Touch(rig).single.items() if key not in found
+            (f"`{key}`", one.unit) for key, one in Touch(rig).single.items() if key not in found
         ]
         single += [(f"`{key}.0` to `{key}.{n - 1}`", "N") for key, n in Touch(rig).arrays.items()]
         text += [FORCES, grid(("channel", "unit"), single)]
