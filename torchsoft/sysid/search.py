@@ -30,6 +30,10 @@ from torchsoft.tables import plain
 BRACKET, FINALISTS = 16, 3
 """Suspects of a bracket, and those of it that are fitted until they converge."""
 
+FAR = 2.0
+"""Misfit per sample above which rounds of halving have steps of the tolerance `LOOSE`, whose errors
+are small beside the misfit."""
+
 FAINT = 0.01
 """Part of the misfit above the noise that a suspect explains by its score test to be in the first
 bracket, however large that is: far from the data score tests order suspects wrongly, and causes had
@@ -191,9 +195,10 @@ def search(
     It ends when refits took `effort` times the work of the fit.
     """
     queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))  # 1.
-    most = end.runner.work * (1.0 + effort)
+    most, finest = end.runner.work * (1.0 + effort), end.check.rtol
     bar = tqdm(total=len(queue), unit="suspect", disable=hidden(end.progress))
     with bar, warnings.catch_warnings(action="ignore"):
+        end = on_loose_steps(end) if end.chi2 > FAR else end
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
         least = max(EVIDENT, FAINT * (linear.square - linear.dof))
         size = max(BRACKET, sum(tests[one.name].gain >= least for one in queue if not one.costly))
@@ -210,7 +215,7 @@ def search(
             best, explained = np.inf, False
             for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
                 bar.set_description(plain(f"refit with {one.name} free"))
-                refit = completed(fits[one].by(end.rtol), best + COMPARABLE)
+                refit = completed(fits[one], finest, best + COMPARABLE)
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
                 best = min(best, refit.square)
@@ -235,9 +240,9 @@ def first_steps(
 
 def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised) -> Fit | None:
     """The fit with a suspect free after the step that its score test predicts, or the best of some
-    parts of it, at the tolerance `LOOSE`; None where it cannot be simulated."""
+    parts of it, on the steps of the end; None where it cannot be simulated."""
     try:
-        start = fit_with(end, one.within(test.favoured)).by(max(LOOSE, end.rtol))
+        start = fit_with(end, one.within(test.favoured))
     except ValueError:
         return None
     c, step = start.problem.coordinates, np.zeros(len(start.x))
@@ -251,7 +256,7 @@ def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised)
     times, best = times / max(1.0, longest / FIRST_STEP), None
     for part in PARTS:
         x = start.within_bounds(start.x + part * times * step)
-        at = start.residuals(x, steps=start.rtol)
+        at = start.residuals(x, steps=end.at.steps)
         if not at.failed:
             fit = start._replace(x=x, at=at)
             best = fit if best is None or fit.square < best.square else best
@@ -278,13 +283,19 @@ def carried_on(fit: Fit, evaluations: int) -> Fit:
     return fit
 
 
-def completed(fit: Fit, most: float = np.inf) -> Fit:
+def on_loose_steps(end: Fit) -> Fit:
+    """The end of a fit on steps of the tolerance `LOOSE`, or as it is where such a run fails."""
+    at = end.residuals(steps=max(LOOSE, end.rtol))
+    return end if at.failed else end._replace(at=at)
+
+
+def completed(fit: Fit, finest: float, most: float) -> Fit:
     """The fit, continued until it converges, with ratios at a bound scanned over their whole range;
-    on fine steps where it leaves at most `most` of the sum of squares."""
+    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares."""
     c = fit.problem.coordinates
     stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
     stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
     end = continued(fit, stage) or fit
     if end.square > most:
         return end._replace(converged=False)
-    return refine_steps(end, TIGHTENINGS if end.loss == "linear" else 0)
+    return refine_steps(end.by(finest), TIGHTENINGS if end.loss == "linear" else 0)
