@@ -18,13 +18,12 @@ from torchsoft.csvfile import UNITS
 from torchsoft.datasets.config import Config as Dataset
 from torchsoft.datasets.fields import Fields
 from torchsoft.materials.presets import PRESETS
-from torchsoft.physics.channels import EFFORT, POSE, RATE, declared
+from torchsoft.physics.channels import EFFORT, POSE, RATE, Touch, declared
 from torchsoft.rigs import RigFile, parts
 from torchsoft.rigs.build import ready
 from torchsoft.rigs.excite import CATALOGUE
 from torchsoft.rigs.goal import Goal
 from torchsoft.rigs.schema import RigTables
-from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.configuration import Config as Identification
 from torchsoft.sysid.unknowns import FAULTS
 from torchsoft.tables import toml_value
@@ -284,10 +283,9 @@ def channels() -> str:
             for one in reversed(found.values())
         ]  # fmt: skip
         text += [f"## Of the rig `{name}`", grid(("channel", "unit", "meaning", "sensor"), rows)]
-        single = [
-            (f"`{key}`", one.unit) for key, one in Touch(rig).single.items() if key not in found
-        ]
-        single += [(f"`{key}.0` to `{key}.{n - 1}`", "N") for key, n in Touch(rig).arrays.items()]
+        touch = Touch(rig)
+        single = [(f"`{key}`", one.unit) for key, one in touch.single.items() if key not in found]
+        single += [(f"`{key}.0` to `{key}.{n - 1}`", "N") for key, n in touch.arrays.items()]
         text += [FORCES, grid(("channel", "unit"), single)]
     return "\n\n".join(text)
 
