@@ -212,13 +212,10 @@ def search(
                 evaluations *= KEPT
             dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
             yield from ((test, None) for test in dropped)
-            best, explained = np.inf, False
-            for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
-                bar.set_description(plain(f"refit with {one.name} free"))
-                refit = completed(fits[one], finest, best + COMPARABLE)
+            explained = False
+            for one, refit in refits(fits, finest, bar):  # 3.
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
-                best = min(best, refit.square)
                 explained = explained or bool(test.suspected and test.passed)
             if explained:
                 return
@@ -281,6 +278,18 @@ def carried_on(fit: Fit, evaluations: int) -> Fit:
     with suppress(Unreachable):
         return gauss_newton(fit, evaluations, ROUGH, anew=True)
     return fit
+
+
+def refits(
+    fits: Mapping[Suspect, Fit], finest: float, bar: "tqdm[Any]"
+) -> Iterator[tuple[Suspect, Fit]]:
+    """The fits, completed, the one that leaves least first."""
+    best = np.inf
+    for one in sorted(fits, key=lambda one: fits[one].square):
+        bar.set_description(plain(f"refit with {one.name} free"))
+        refit = completed(fits[one], finest, best + COMPARABLE)
+        best = min(best, refit.square)
+        yield one, refit
 
 
 def on_loose_steps(end: Fit) -> Fit:
