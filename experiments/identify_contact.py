@@ -24,7 +24,7 @@ from scipy.signal import lfilter
 
 from experiments.frame import COARSE, Table, options, write
 from torchsoft import RigFile, excite
-from torchsoft.rigs.excite import CATALOGUE, Excitation
+from torchsoft.rigs.excite import CATALOGUE, Excitation, sines, strokes
 from torchsoft.sysid import IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.report import report
 from torchsoft.sysid.runs import forget
@@ -65,12 +65,11 @@ def motions(smoke: bool) -> dict[str, Excitation]:
     """Motions of the recordings, by their names; the last one is to be predicted."""
     if not smoke:
         return {name: CATALOGUE[name] for name in (*FITTED, HELD_OUT)}
-    strokes = {"kind": "strokes", "travel": 8e-3, "stroke_time": 0.2}
-    shake = {"kind": "multi_sine", "band": (2.0, 12.0)}
-    roll, press = shake | {"amplitude": 6e-3, "seed": 0}, shake | {"amplitude": 1e-4, "seed": 1}
+    band = 2.0, 12.0
+    shaking = sines(6e-3, band, 0), sines(1e-4, band, 1)
     return {
-        "strokes": Excitation(strokes, duration=0.9),
-        "shaking": Excitation(roll, press, duration=0.9, depth=7e-4),
+        "strokes": Excitation(strokes(8e-3, 0.2), duration=0.9),
+        "shaking": Excitation(*shaking, duration=0.9, depth=7e-4),
     }
 
 

@@ -1,7 +1,6 @@
-"""Question: how small can an ordinary differential equation for disc and bracket be, and where does
-it stop being enough?
+"""Question: how small can an ordinary differential equation for disc and bracket be?
 
-Stick. Both pads stick to the disc: each is a spring k and a dashpot c on its slip
+Both pads stick to the disc: each is a spring k and a dashpot c on its slip
 (`torchsoft.reduced.terms`), so that
     m x_C''     = k (x_Br - 2 x_C) + c (...)'
     I theta''   = -r [k (x_Br + 2 r theta) + c (...)'] - c_r theta'
@@ -10,25 +9,19 @@ with F_x known from the control law. What mechanics expects of k, c, r and c_r i
 full model, linearised in the grasp, with pads and stretches condensed at rest: not quite a spring
 and a dashpot at every frequency. The training motions are taps: small random velocities of disc and
 bracket and a broad multi-sine, some micrometres large. The radius comes from one roll to the other
-side. Held out: the paper's manipulation.
-
-Slip. A light grasp, the horizontal loop on the bracket, strokes ever faster: the disc rolls on the
-lower pad and the upper one slips. Held out: other strokes. Errors are root mean squares over the
-signal's range, worst of the six states.
+side. Held out: the paper's manipulation. Errors are root mean squares over the signal's range,
+worst of the six states.
 
 Command: .venv/bin/python -m experiments.reduced_model [--smoke]
-Expected: stick: 8 terms, the very ones above; held-out error 0.3 % of range (node transitions in
+Expected: 8 terms, the very ones above; held-out error 0.3 % of range (node transitions in
 the spin), more than 100 times faster than the full model; k, c and the masses within 10 % of the
-expectation but for the spin's k (-11 %) and c_r (-16 %). Slip: 12 terms, 1 % up to 40 m/s2, 2 to
-4 % up to 320 m/s2, where a model without saturation is off by the whole range; 22 % in a grasp of
-another depth, which is another mode. Half a minute on one core.
+expectation but for the spin's k (-11 %) and c_r (-16 %). Half a minute on one core.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,15 +29,13 @@ from threadpoolctl import threadpool_limits
 from torch import nn
 
 from experiments.frame import COARSE, Table, grid, numbers, options, write
-from torchsoft import Profile, Reference, Rig, RigFile, excite, hold, simulate
+from torchsoft import Profile, Reference, Rig, RigFile, hold, simulate
 from torchsoft.files import finite
-from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.motion import Waves, wave
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, record, rolling_radius
-from torchsoft.reduced.terms import friction, joined, mechanics
-from torchsoft.rigs.excite import Excitation
+from torchsoft.reduced.terms import mechanics
 from torchsoft.solve.diagnostics import linearised
 
 WAVE, KICK, BAND = 1e-5, 2e-3, (3.0, 150.0)
@@ -53,9 +44,6 @@ WAVE, KICK, BAND = 1e-5, 2e-3, (3.0, 150.0)
 
 SETTLED = 1.0
 """Time [s] at which the grasp has settled."""
-
-DEPTH = 2e-4
-"""Of the light grasp [m]."""
 
 PAPER = RigFile.ready("paper")
 X_0 = PAPER["bodies.disc.start.x"]
@@ -74,12 +62,6 @@ class Config:
     scenario: float = 1.0  # the manipulation's times, as parts of the paper's
     thresholds: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3)
     models: int = 50  # members of an ensemble
-    # of the training strokes of 20 mm, of those of 15 mm to the other side that choose thresholds,
-    # and of those held out [s]
-    stroke_times: tuple[float, ...] = (0.12, 0.08, 0.065, 0.05, 0.04, 0.03)
-    checking_times: tuple[float, ...] = (0.07, 0.04)
-    other_times: tuple[float, ...] = (0.15, 0.1, 0.055, 0.045, 0.035, 0.03, 0.025, 0.02)
-    speeds: tuple[float, ...] = (0.005, 0.01, 0.02)  # that tanh(s' / speed) is tried with [m/s]
     smoke: bool = False  # a size that takes seconds
 
 
@@ -183,7 +165,7 @@ def expected(grasp: Grasp, frequency: float = 1.0) -> tuple[float, dict[tuple[st
     }
 
 
-def study_stick(config: Config) -> dict[str, Any]:
+def study(config: Config) -> dict[str, Any]:
     file = PAPER.override(COARSELY if config.smoke else {})
     times = [config.scenario * time for time in file["motion.x_d.times"]]
     whole = file.override({"motion.x_d.times": times}).build()
@@ -218,103 +200,21 @@ def study_stick(config: Config) -> dict[str, Any]:
     }  # fmt: skip
 
 
-class Stroke(NamedTuple):
-    """Strokes in a light grasp: peak acceleration [m/s2], slipping part of the upper pad's touching
-    nodes, and wall time of the full model [s]."""
-
-    record: Record
-    acceleration: float
-    slipping: float
-    wall_s: float
-
-
-def strokes(travel: float, stroke_time: float, depth: float = DEPTH) -> Stroke:
-    """Strokes there and back from a light grasp with the horizontal loop on the bracket."""
-    roll = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
-    e = Excitation(roll, duration=0.5 + 4 * stroke_time + 0.01, depth=depth)
-    file = PAPER.override({"contact.v_s": 0.05})
-    built, t, start = excite(file, e).build(), grid(e.duration, 5e-4), 1000
-    run = built.run(t[: start + 1], step=5e-4)
-    rest = built.run(t[start:], y0=run.y[-1], step=5e-4)
-    peak = float(np.abs(np.gradient(rest["v_x_Br"].numpy(), 5e-4)).max())
-    states = rest.contact_state["U"]
-    slipping = float((states == SLIPPING).sum() / (states > 0).sum())
-    return Stroke(record(rest), peak, slipping, rest.stats.wall_s)
-
-
-def sticking(model: ReducedModel) -> ReducedModel:
-    """The model's limit for small slip: every tanh(s' / speed) is s' / speed."""
-    equations = {
-        name: [
-            (replace(term, factors=tuple(f._replace(shape="linear") for f in term.factors)), x)
-            for term, x in pairs
-        ]
-        for name, pairs in model.equations().items()
-    }
-    return ReducedModel(
-        model.states, model.inputs, model.kinematics, equations, feedback=model.feedback,
-        scale=model.scale,
-    )  # fmt: skip
-
-
-def study_slip(config: Config) -> dict[str, Any]:
-    train = [strokes(-20e-3, T).record for T in config.stroke_times]
-    other = {T: strokes(15e-3, T) for T in (*config.checking_times, *config.other_times)}
-    r = rolling_radius([train[int(np.argmax(config.stroke_times))]])
-    recipe = Recipe(width=0.004, window=min(config.stroke_times) * 4)
-    checks = [other[T].record for T in config.checking_times]
-    choices = []
-    for speed in config.speeds:
-        problem = assemble(train, joined(mechanics(r, alike=False), friction(r, speed)), recipe)
-        choices.append(choose(problem, checks, recipe, config.thresholds, loop(train), each=False))
-    errors = [choice.tried[choice.index]["nrmse"] for choice in choices]
-    good = [one.model for one, error in zip(choices, errors) if error <= 1.1 * min(errors)]
-    model = refit(train, min(good, key=lambda one: len(one.terms)), recipe, config)
-    limit = sticking(model)
-    by_stroke = [
-        {
-            "stroke_time_s": T, "acceleration_m_s2": one.acceleration, "slipping": one.slipping,
-            "held_out": T in config.other_times, "nrmse": score(model, one.record).worst,
-            "nrmse_linear": score(limit, one.record).worst,
-            "speedup": one.wall_s / rollout_time(model, one.record, 3),
-        }
-        for T, one in sorted(other.items(), reverse=True)
-    ]  # fmt: skip
-    deep = strokes(15e-3, 0.04, depth=2 * DEPTH)
-    return {
-        "terms": len(model.terms),
-        "heldout_nrmse": float(np.mean([one["nrmse"] for one in by_stroke if one["held_out"]])),
-        "speedup": median(one["speedup"] for one in by_stroke),
-        "equations": model.text(), "rolling_radius_mm": 1e3 * r, "by_stroke": by_stroke,
-        "another_grasp": score(model, deep.record).worst,
-    }  # fmt: skip
-
-
 def tables(found: dict[str, Any]) -> dict[str, Table]:
-    """Both regimes; the coefficients beside mechanics; errors under slip by stroke."""
+    """The model in numbers; the coefficients beside mechanics."""
     names = {"terms": "terms", "heldout_nrmse": "held-out error", "speedup": "speed-up"}
-    regimes = {
-        regime: {shown: one[name] for name, shown in names.items()} for regime, one in found.items()
-    }
     coefficients = [
         (
             f"{row['equation']}' of {row['term']}", f"{row['value']:.4g}",
             "{:.4g} .. {:.4g}".format(*row["interval"]),
             "-" if row["error"] is None else f"{row['error']:+.1%}",
         )
-        for row in found["stick"]["coefficients"]
+        for row in found["coefficients"]
     ]  # fmt: skip
-    columns = ("acceleration_m_s2", "slipping", "nrmse", "nrmse_linear")
-    strokes = {
-        f"{one['stroke_time_s']:g} s": {name: one[name] for name in columns}
-        for one in found["slip"]["by_stroke"]
-    }
-    strokes["another grasp"] = {"nrmse": found["slip"]["another_grasp"]}
     head = ("coefficient", "found", "90 % interval", "over mechanics less one")
     return {
-        "regimes": numbers("regime", regimes),
+        "model": numbers("regime", {"stick": {shown: found[k] for k, shown in names.items()}}),
         "coefficients": Table(head, coefficients),
-        "strokes": numbers("stroke under slip", strokes, ".2g"),
     }
 
 
@@ -322,13 +222,11 @@ def main(config: Config) -> None:
     if config.smoke:
         config = replace(
             config, taps=6, tap_time=0.15, validation=2e-4, scenario=0.2,
-            thresholds=(0.03, 0.07, 0.14), models=10, stroke_times=(0.08, 0.05, 0.03),
-            checking_times=(0.06,), other_times=(0.025,), speeds=(0.005,),
+            thresholds=(0.03, 0.07, 0.14), models=10,
         )  # fmt: skip
     with threadpool_limits(1):  # what is timed, is timed on one core
-        found = finite({"stick": study_stick(config), "slip": study_slip(config)})
-    for name, one in found.items():
-        print(f"\n{name}:", *one["equations"], sep="\n")
+        found = finite(study(config))
+    print(*found["equations"], sep="\n")
     write(config, found, tables(found))
 
 

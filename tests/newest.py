@@ -94,17 +94,6 @@ def main(python: str) -> None:
         small = ROOT / "data_gen" / "configs" / "smoke.toml"
         run(bin / "torchsoft", "dataset", "make", small, "--out", "set", where=work)
         run(bin / "torchsoft", "dataset", "check", "set", where=work)
-        run(
-            bin / "torchsoft",
-            "dataset",
-            "export",
-            "set",
-            "--to",
-            "mcap",
-            "--out",
-            "logs",
-            where=work,
-        )
     print(f"all of it in {time.monotonic() - begin:.0f} s")
 
 

@@ -72,7 +72,6 @@ def test_neither_an_import_nor_help_waits_for_torch(code):
 COMMANDS = (
     "", "init", "check", "run", "plot", "plan", "reduce", "design", "rehearse", "identify",
     "explain", "profile", "material fit", "material presets", "dataset make", "dataset check",
-    "dataset export",
 )  # fmt: skip
 
 

@@ -4,15 +4,12 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import time
 import tomllib
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from threading import Thread
 from typing import Any
 
 import fsspec
@@ -29,9 +26,8 @@ from torchsoft.cli import main
 from torchsoft.datasets import generate as making
 from torchsoft.datasets import open_dataset
 from torchsoft.datasets.card import card
-from torchsoft.datasets.check import check, figure
+from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.export import export_logs
 from torchsoft.datasets.files import Manifest, StoreError, listed
 from torchsoft.datasets.generate import (
     Part,
@@ -277,66 +273,27 @@ def test_the_bytes_of_a_set_do_not_depend_on_how_it_is_made(
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("how", ["processes", "a cluster that loses a worker"])
-def test_processes_make_the_same_bytes(made, tmp_path, how):
-    folder, url = tmp_path / "set", str(tmp_path / "set")
-    if how == "processes":
-        with local_processes(2) as executor:
-            assert generate(made[1], url, executor, 2, progress=False) == 0
-    else:
-        from distributed import Client, LocalCluster
-
-        local: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
-        with LocalCluster(**local) as cluster, Client(cluster) as client:
-            pids = [*client.run(os.getpid).values()]
-
-            def kill_once_started() -> None:
-                while not [*folder.glob("finished/*.sha256")]:
-                    time.sleep(0.02)
-                os.kill(pids[0], signal.SIGKILL)
-
-            killer = Thread(target=kill_once_started)
-            killer.start()
-            executor = client.get_executor(retries=3, pure=False)
-            generate(made[1], url, executor, 2, progress=False)
-            killer.join()
-    assert objects(url) == objects(str(made[0]))
+def test_processes_make_the_same_bytes(made, tmp_path):
+    with local_processes(2) as executor:
+        assert generate(made[1], str(tmp_path / "set"), executor, 2, progress=False) == 0
+    assert objects(str(tmp_path / "set")) == objects(str(made[0]))
 
 
-def test_two_who_make_one_set_at_once_share_the_work(made, tmp_path, monkeypatch):
-    """Every trajectory is simulated once, and the slower one to lay the folder out undoes
-    nothing."""
-    simulated, url = list[int](), str(tmp_path / "set")
+def test_two_who_make_one_set_at_once_make_the_same(made, tmp_path, monkeypatch):
+    """The slower one to lay the folder out undoes nothing, and a finished shard is left."""
+    url = str(tmp_path / "set")
     row = simulate_task(made[1], made[1].subject.task(0, points(made[1])[0]))
-
-    def simulate(config: Config, task: Task) -> Any:
-        simulated.append(task.index)
-        time.sleep(0.01)
-        return row | task.labels
-
-    monkeypatch.setattr(making, "simulate_task", simulate)
-    open_or_create(url, made[1])  # zarr's warnings are not for two threads
+    monkeypatch.setattr(making, "simulate_task", lambda _, task: row | task.labels)
+    store = open_or_create(url, made[1])  # zarr's warnings are not for two threads
     with ThreadPoolExecutor(2) as two:
         both = [two.submit(generate, made[1], url, Serial(), progress=False) for _ in range(2)]
     assert [one.result() for one in both] == [0, 0]
-    assert sorted(simulated) == [*range(COUNT)]
+    assert not [*Path(url).rglob("*.partial")]
     before = objects(url)
     for config in (made[1], made[1].model_copy(update={"seed": 99})):
         create(url, config)
         assert objects(url) == before
-
-
-def test_a_shard_is_made_by_one_process_at_a_time(made, half, tmp_path, monkeypatch, capsys):
-    """The second one leaves it, and reports so."""
-    store, path = open_or_create(str(half), made[1]), written(tmp_path)
     monkeypatch.setattr(making, "simulate_task", None)  # nothing is to be made
-    with store.claim(0) as first:
-        with store.claim(0) as second:
-            assert (first, second) == (True, False)
-        assert main(["dataset", "make", str(path), "--out", str(half), "--workers", "1"]) == 0
-    reported = capsys.readouterr().out
-    assert re.search(r"making shards 0\n.*\b3 trajectories in[^$]*1 of 3 shards are left", reported)
-    assert not [*half.rglob("*.partial")]
     assert making.run_shard(store, 1, None) == (2, 0)
 
 
@@ -484,19 +441,15 @@ def test_what_is_not_finite_is_not_written(made, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_log_is_a_recording(made, data, half, tmp_path, capsys):
+def test_a_log_is_a_recording(data, tmp_path):
     """To the last bit, of a set or of a run; one that is damaged or of others is rejected."""
-    export = ["dataset", "export", str(made[0]), "--out", str(tmp_path / "logs")]
-    assert main(export) == 0
-    assert main(export) == 2
-    assert "logs is not empty; name a new folder" in capsys.readouterr().err
-    with pytest.raises(StoreError, match=r"1 of 3 shards are not finished"):
-        export_logs(str(half), tmp_path / "out")
-    read = read_log(tmp_path / "logs" / "000001.mcap")
+    log = tmp_path / "000001.mcap"
+    write_log(log, data.isel(trajectory=1), {"split": "train"})
+    read = read_log(log)
     for name in ("x_disc", "effort_x", "x_d"):
         np.testing.assert_array_equal(read[name], data[name][1])
         assert read[name].attrs["units"] == data[name].attrs["units"]
-    whole = (tmp_path / "logs" / "000001.mcap").read_bytes()
+    whole = log.read_bytes()
     for damage in (whole[: len(whole) // 2], whole[:300] + b"x" + whole[301:], b"t,x\n0,1\n"):
         (tmp_path / "damaged.mcap").write_bytes(damage)
         with pytest.raises(ValueError, match=r"damaged\.mcap is not a log of torchsoft"):
@@ -537,22 +490,6 @@ def test_folders_that_hold_something_else_are_rejected(made, tmp_path):
         open_or_create(str(made[0]), made[1].model_copy(update={"seed": 99}))
 
 
-@pytest.mark.slow
-def test_the_check_draws_the_coverage_outside_of_the_set(made, data, tmp_path, capsys):
-    picture = str(tmp_path / "coverage.png")
-    assert main(["dataset", "check", str(made[0]), "--picture", picture]) == 0
-    assert "5 trajectories" in capsys.readouterr().out
-    assert (tmp_path / "coverage.png").stat().st_size > 10_000
-    drawn = figure(data, made[1])
-    assert drawn.legends[0].get_texts()
-    assert all(axes.has_data() for axes in drawn.axes if axes.axison)
-    for part, words in (
-        ("export", ["--out", str(made[0] / "logs")]),
-        ("check", ["--picture", str(made[0] / "picture.png")]),
-    ):
-        assert main(["dataset", part, str(made[0]), *words]) == 2
-
-
 def test_parts_share_every_shard_out_once(made):
     config = made[1].model_copy(update={"trajectories": 37})
     for of in (1, 2, 5, 19):
@@ -564,32 +501,14 @@ def test_parts_share_every_shard_out_once(made):
     assert listed(range(0, 100, 2)).endswith("38, ...")
 
 
-def test_the_job_array_makes_its_part(made, half, tmp_path, monkeypatch, capsys):
-    """Its last line, expanded by a shell, is the command that makes a part; finished parts are not
-    in it."""
-    (folder := tmp_path / "a place").mkdir()
-    path, out = written(folder), str(tmp_path / "new set")
-    arguments = ["dataset", "slurm", str(path), "--out", out, "--parts", "2"]
-    assert main(arguments) == 0
-    script = capsys.readouterr().out
-    assert script.startswith("#!/bin/bash\n#SBATCH")
-    assert "--array=1-2\n" in script
-    run = subprocess.run(
-        ["/bin/bash", "-c", script.replace("exec ", "printf '%s\\n' ")], check=True, text=True,
-        env={"SLURM_ARRAY_TASK_ID": "2", "SLURM_CPUS_PER_TASK": "1"}, capture_output=True,
-    )  # fmt: skip
-    python, module, name, *command = run.stdout.splitlines()
-    assert (Path(python).name[:6], module, name) == ("python", "-m", "torchsoft")
-    assert main(command) == 0
+def test_a_part_is_made_alone(made, tmp_path):
+    """As a job of an array makes it."""
+    path, out = written(tmp_path), str(tmp_path / "set")
+    command = ["dataset", "make", str(path), "--out", out, "--workers", "0", "--part"]
+    assert main([*command, "2/2"]) == 0
     assert Store(out, made[1]).unfinished() == [0, 2]
-    arguments[4] = str(half)
-    assert main(arguments) == 0
-    assert "--array=1\n" in capsys.readouterr().out
-    arguments[4] = str(made[0])
-    assert main(arguments) == 2
-    assert "all 3 shards are finished" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["dataset", "make", str(path), "--out", str(half), "--part", "3/2"])
+        main([*command, "3/2"])
 
 
 @pytest.mark.slow

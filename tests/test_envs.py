@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 import torchsoft.envs
 from torchsoft import Trajectory, simulate
-from torchsoft.envs import RigEnv, RigVectorEnv, TargetPose, reorient
+from torchsoft.envs import RigEnv, TargetPose, reorient
 from torchsoft.envs.rig_env import RedrawnStart
 from torchsoft.physics.motion import Lines, Reference
 from torchsoft.rigs.build import RigFile
@@ -271,35 +271,6 @@ def test_a_copy_in_the_middle_of_an_episode_goes_on_alike_and_apart():
     copied.unwrapped.dynamics.step(env.moment, f64(0.2, -0.3, 0.1)).reward.backward()
     assert E[0].grad is None
     assert E[1].grad != 0.0
-    several = RigVectorEnv([lambda: small(duration=0.1)] * 2, threads=2)
-    several.reset(seed=3)
-    others = copy.deepcopy(several)
-    actions = np.stack((TURN, -TURN))
-    assert np.array_equal(several.step(actions)[0], others.step(actions)[0])
-    several.close()
-    others.close()
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_threads_do_not_change_results(mode):
-    ends = []
-    for threads in (1, 2):
-        envs = RigVectorEnv([lambda: small(duration=0.1)] * 2, threads=threads, autoreset_mode=mode)
-        envs.reset(seed=3)
-        ends.append([envs.step(np.stack((TURN, -TURN))) for _ in range(3)])
-        envs.close()
-    for one, other in zip(*ends):
-        assert all(np.array_equal(a, b) for a, b in zip(one[:4], other[:4]))
-    assert ends[0][1][3].all()
-    over = ends[0][2 if mode == "NextStep" else 1]
-    assert (over[0][:, -3:] != TURN).any()  # of the start of the next episode
-    assert ("final_obs" in over[4]) == (mode == "SameStep")
-
-
-def test_make_vec_takes_threads():
-    envs = gymnasium.make_vec("torchsoft/Reorient-v0", 2, vector_kwargs={})
-    assert isinstance(envs, RigVectorEnv)
-    envs.close()
 
 
 REJECTED: list[tuple[dict[str, Any], str]] = [

@@ -120,7 +120,7 @@ def test_the_literal_law(slipping):
     p, h, depth = OWN._replace(literal=True), STEP, 5e-5
     for v, s in product((0.02, -0.02), (1e-6, 1e-3)):
         fx, fy, torque, stretch, slips, _ = node(
-            p, h, 0.0, 0.0, v / (p.radius - depth), 0.0, -(p.radius - depth), s, slipping,
+            p, h, 0.0, 0.0, 0.0, v / (p.radius - depth), 0.0, -(p.radius - depth), s, slipping,
             p.mu_s, p.mu_k,
         )  # fmt: skip
         F_N, e = p.K_n * depth, p.K_t * stretch + p.R_t * v

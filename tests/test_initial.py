@@ -129,7 +129,6 @@ def test_a_plan_for_a_parameter_moves_the_start():
     target = Target(channel="y_disc", value=goal, tolerance=1e-8)
     found = plan(
         built.rig, t, {E: (0.65e6, 0.8e6)}, targets={"y": target}, y0=built.initial, iterations=5,
-        threads=1,
     )  # fmt: skip
     assert found.reached
     assert float(found.parameters[E]) == pytest.approx(at, rel=2e-3)

@@ -74,7 +74,7 @@ def searched(free: Free, rtol: float, over: Any = None, terms: Terms | None = No
     variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
     terms = terms or Terms(None, {"turn": TURN}, {})
     evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, over or {}, rtol)
-    return Search(evaluator, Criterion(variables, False, 1.0), math.inf, tqdm(disable=True))
+    return Search(evaluator, Criterion(variables, 1.0), math.inf, tqdm(disable=True))
 
 
 def test_slopes_are_the_differences():
@@ -146,13 +146,10 @@ def test_a_limit_is_kept_at_a_price(turned):
 
 @pytest.mark.slow
 def test_an_objective_is_lowered_within_targets():
-    """The least work of a finger that may choose its gain, by the worst of two draws."""
+    """The least work of a finger that may choose its gain, over two draws."""
     objective = lambda run: run["effort_left_y"].square().mean()
     over = {"laws.dry.K_n": torch.tensor([1e5, 1.1e5])}
-    found = planned(
-        FREE, objective=objective, targets={"turn": TURN}, over=over, robust="worst",
-        iterations=3,
-    )  # fmt: skip
+    found = planned(FREE, objective=objective, targets={"turn": TURN}, over=over, iterations=3)
     assert (found.made_by["draws"], found.holds) == (2, 1.0)
     assert found.value <= found.history[0].value or found.history[0].missed > 0
 

@@ -39,12 +39,9 @@ SHORTER = {
 ELSEWHERE = {
     "pip install": "an installation",
     "rehearse fit.toml": "test_sysid_rigs.py",
-    "tcp://head": "test_datasets.py",
-    "dask_jobqueue": "a cluster",
-    "dataset slurm": "test_datasets.py",
+    "out/logs": "test_datasets.py",
     "LeRobotDataset": "a package",
     "out/the_well": "a package",
-    "sbatch": "a cluster",
 }
 """Parts of blocks that need more than a test has, and where they are tried instead."""
 LONG = "laboratory", "identification", "reduced"

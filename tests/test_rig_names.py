@@ -236,7 +236,6 @@ def test_names_replace_what_is_there_and_tables_merge():
     merged = PAPER.override(motion={"y_d": {"values_2": 48e-3}})
     assert merged.motion["y_d"].values == ("start", 48e-3)
     assert PAPER.override({"motion.y_d.values_2": 48e-3}) == merged
-    assert PAPER.override({"motion.y_d.values.1": 48e-3}) == merged  # as in files of before
     hold = {"kind": "hold", "value": 50e-3}
     assert PAPER.override({"motion.y_d": hold}) == PAPER.override(motion={"y_d": hold})
 

@@ -15,7 +15,7 @@ from test_sysid_rigs import replaced
 
 from torchsoft import simulate
 from torchsoft.cli import main
-from torchsoft.plan.knots import Bounds, Moves, profile
+from torchsoft.plan.knots import Bounds, Moves
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.excite import Excitation
 from torchsoft.rigs.written import located
@@ -42,7 +42,7 @@ PLAN = Excitation(
     duration=0.25, grasp=0.1, depth=DEPTH,
 )  # fmt: skip
 BOUNDS = {
-    "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13, shortest=0.02),
+    "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13),
     "y_d": Bounds(low=0.048, high=0.0499, speed=0.1, after=0.13),
 }
 SENSORS = {name: RIG[name] for name in ("x_C", "theta_C", "y_Br", "effort_x", "effort_y")}
@@ -90,7 +90,7 @@ def test_a_criterion_has_its_derivative_and_is_a_logarithm_of_deviations(criteri
 
 
 def test_slopes_are_those_of_differences(plan, monkeypatch):
-    """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted
+    """Of values of the knots, with what excess costs; a sensor's gain and bias are fitted
     beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
     faulty = {"effort_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}
@@ -142,9 +142,6 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan):
         value, rate = reference(t, [name])[:, 0].unbind(-1)
         assert one.low - 1e-9 <= float(value.min()) <= float(value.max()) <= one.high + 1e-9
         assert float(rate.abs().max()) <= one.speed * (1 + 1e-6)
-    times = profile(reference, "x_d").times
-    assert float(times[1:].diff().min()) >= 0.02 * (1 - 1e-6)
-    assert float(times[-1]) <= 0.25 * (1 + 1e-9)
 
 
 def bounds(name: str, low: float, high: float, after: float) -> dict[str, Any]:
@@ -235,7 +232,7 @@ theta_disc.noise = 5e-4
 x_lower.noise = 1e-5
 effort_lift.noise = 0.05
 [design]
-iterations = 4
+iterations = 8
 rtol = 1e-3
 limits.x_upper = [-0.03, 0.05]
 [design.candidates]

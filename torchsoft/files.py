@@ -32,9 +32,6 @@ CHECKPOINT = "torchsoft-checkpoint"
 PARTIAL = re.compile(r"\.[0-9a-f]{16}\.partial$")
 """End of the name of a partial file, after the name of the file that it becomes."""
 
-WAIT = 0.25
-"""Time [s] to wait for a file that another process holds, perhaps for an instant."""
-
 NO_LOCKS = errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK
 """Errors of file systems without locks."""
 
@@ -79,26 +76,11 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
         own.release()
 
 
-@contextmanager
-def claimed(path: Path) -> Iterator[bool]:
-    """Whether the partial file `path`, emptied, is this process's: nobody else has it. It goes with
-    its holder. Where a file system has no locks, everybody is given it."""
-    own = held(path)
-    try:
-        if own is not None:
-            os.truncate(path, 0)
-        yield own is not None
-    finally:
-        if own is not None:
-            path.unlink(missing_ok=True)
-            own.release()
-
-
-def held(path: Path, wait: float = WAIT) -> FileLock | None:
+def held(path: Path) -> FileLock | None:
     """A lock on the file `path` itself, made where it is not there and left as it is; None where
     another process has it. It is not locked where a file system has no locks."""
     make_folder(path.parent)
-    own = FileLock(path, timeout=wait, fallback_to_soft=False)
+    own = FileLock(path, timeout=0, fallback_to_soft=False)
     try:
         own.acquire()
     except Timeout:
@@ -115,7 +97,7 @@ def remove_partials(paths: Iterable[Path]) -> None:
         if not PARTIAL.search(path.name):
             continue
         with suppress(OSError):  # not ours to touch
-            if (own := held(path, 0.0)) is None:
+            if (own := held(path)) is None:
                 continue
             try:
                 if own.is_locked:

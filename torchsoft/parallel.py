@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -103,20 +103,18 @@ def released_turn() -> Iterator[None]:
 
 
 def parallel_map(
-    work: Callable[[int], T], count: int, threads: int | None = None, *, turns: bool = False,
-    pool: ThreadPoolExecutor | None = None,
-) -> Iterator[tuple[int, T]]:  # fmt: skip
+    work: Callable[[int], T], count: int, threads: int | None = None, *, turns: bool = False
+) -> Iterator[tuple[int, T]]:
     """`work(i)` for i below `count`, in so many threads (one a core by default), as (i, result) in
     the order of their ends.
 
     The threads inherit torch's grad mode; each computes on one core. With `turns` one thread at a
     time computes in Python: torch releases the interpreter's lock at every operation, and threads
     that hand it over each time are slower than one alone. An exception cancels work that has not
-    begun, and so does Ctrl-C; running work is waited for. A `pool` of `executor` is used and kept
-    in the place of one for this call alone, which costs 10 ms.
+    begun, and so does Ctrl-C; running work is waited for.
     """
     threads = min(count, cores() if threads is None else threads)
-    if threads <= 1 and pool is None:
+    if threads <= 1:
         for i in range(count):
             yield i, work(i)
         return
@@ -132,10 +130,7 @@ def parallel_map(
             finally:
                 _own.turn = None
 
-    with ExitStack() as stack:
-        if pool is None:
-            stack.enter_context(single_threaded())
-            pool = stack.enter_context(executor(threads))
+    with single_threaded(), executor(threads) as pool:
         futures = {pool.submit(one, i): i for i in range(count)}
         try:
             for future in as_completed(futures):

@@ -18,7 +18,7 @@ from experiments.identify_contact import (
 )
 from experiments.validation.foreign import Numbers, simulate
 from torchsoft import Reference, RigFile, excite
-from torchsoft.rigs.excite import Excitation
+from torchsoft.rigs.excite import Excitation, chirp, roll_to, sines, strokes
 from torchsoft.sysid import Problem, Recording
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.recording import Array
@@ -40,45 +40,30 @@ FACTOR = 1.6
 """Every parameter starts off by this factor, one up and the next one down."""
 
 
-def sines(roll: float, band: tuple[float, float], duration: float, depth: float) -> Excitation:
-    """Shaken along [m] and across the pads."""
-    sums = [
-        {"kind": "multi_sine", "amplitude": size, "band": band, "seed": seed}
-        for seed, size in enumerate((roll, 2e-4))
-    ]
-    return Excitation(*sums, duration=duration, depth=depth)
-
-
-def strokes(travel: float, stroke_time: float, duration: float, depth: float) -> Excitation:
-    motion = {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
-    return Excitation(motion, None, duration, depth)
-
-
-def sweep(amplitude: float, first: float, last: float) -> dict[str, Any]:
-    return {"kind": "chirp", "amplitude": amplitude, "first": first, "last": last}
-
-
-def pressing(
-    travel: float, amplitude: float, frequency: float, duration: float, depth: float
-) -> Excitation:
-    """Pressed at a frequency [Hz] while the disc rolls."""
-    times, values = (0.5, duration), (0.0, travel)
-    roll = {"kind": "profile", "times": times, "values": values, "offset": "start"}
-    return Excitation(roll, sweep(amplitude, frequency, frequency), duration, depth)
-
-
 GENTLE = ("deep pressing", "light shaking", "light jerks")
 """Motions that show all eight parameters together."""
 
+SHAKEN = (4.0, 20.0)
+"""Band of shaking [Hz]."""
+
+ACROSS = sines(2e-4, SHAKEN, 1)
+"""Shaking across the pads."""
+
 MOTIONS = {
-    "deep pressing": pressing(20e-3, 8e-4, 17.0, 1.2, 2.4e-3),
-    "light shaking": sines(6e-3, (4.0, 20.0), 1.2, 2e-4),
-    "light jerks": strokes(80e-3, 0.2, 1.0, 1e-4),
-    "deep chirp": Excitation(sweep(5e-3, 1.0, 25.0), sweep(5e-4, 1.0, 25.0), 1.3, 2.4e-3),
-    "hard shaking": sines(12.5e-3, (4.0, 20.0), 1.2, 2e-4),
-    "long shaking": sines(12.5e-3, (4.0, 20.0), 1.5, 2e-4),
-    "gentle roll": strokes(10e-3, 0.6, 1.5, 1.4e-3),
-    "shaking": sines(6e-3, (4.0, 17.0), 0.9, 3e-4),
+    "deep pressing": Excitation(
+        roll_to(20e-3, 1.2), chirp(8e-4, 17.0, 17.0), duration=1.2, depth=2.4e-3
+    ),
+    "light shaking": Excitation(sines(6e-3, SHAKEN, 0), ACROSS, duration=1.2, depth=2e-4),
+    "light jerks": Excitation(strokes(80e-3, 0.2), duration=1.0, depth=1e-4),
+    "deep chirp": Excitation(
+        chirp(5e-3, 1.0, 25.0), chirp(5e-4, 1.0, 25.0), duration=1.3, depth=2.4e-3
+    ),
+    "hard shaking": Excitation(sines(12.5e-3, SHAKEN, 0), ACROSS, duration=1.2, depth=2e-4),
+    "long shaking": Excitation(sines(12.5e-3, SHAKEN, 0), ACROSS, duration=1.5, depth=2e-4),
+    "gentle roll": Excitation(strokes(10e-3, 0.6), duration=1.5, depth=1.4e-3),
+    "shaking": Excitation(
+        sines(6e-3, (4.0, 17.0), 0), sines(2e-4, (4.0, 17.0), 1), duration=0.9, depth=3e-4
+    ),
 }
 """Motions of a second or so; the last one is that of smoke runs."""
 

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from experiments.frame import COARSE, numbers, options, timed, write
 from torchsoft import BuiltRig, RigFile, excite
-from torchsoft.rigs.excite import Excitation
+from torchsoft.rigs.excite import Excitation, sines, strokes
 
 EIGHT = (
     *(f"contact.{name}" for name in ("K_n", "R_n", "K_t", "R_t", "mu_s", "mu_k")),
@@ -48,14 +48,12 @@ class Config:
 
 def motions(config: Config) -> dict[str, BuiltRig]:
     paper = RigFile.ready("paper").override(COARSE if config.smoke else {})
-    roll = {"kind": "strokes", "travel": 2e-3, "stroke_time": 0.02}
-    shake = {"kind": "multi_sine", "band": (2.0, 10.0)}
-    shaking = shake | {"amplitude": 1e-3, "seed": 0}, shake | {"amplitude": 5e-5, "seed": 1}
+    shaking = sines(1e-3, (2.0, 10.0), 0), sines(5e-5, (2.0, 10.0), 1)
     stroke, fine = "stroke of 2 mm in 20 ms", {"outputs.interval": 5e-3}
     files = {
         "grasp and roll out": paper.override(outputs={"duration": config.roll, "snapshots": []}),
         "light shaking": excite(paper, Excitation(*shaking, duration=1.0)).override(fine),
-        stroke: excite(paper, Excitation(roll, duration=0.54)).override(fine),
+        stroke: excite(paper, Excitation(strokes(2e-3, 0.02), duration=0.54)).override(fine),
     }
     return {name: files[name].build() for name in ([stroke] if config.smoke else files)}
 

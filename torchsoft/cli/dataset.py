@@ -1,4 +1,4 @@
-"""Commands on datasets: make, slurm, check, export."""
+"""Commands on datasets: make and check."""
 
 import argparse
 import os
@@ -10,20 +10,7 @@ from torchsoft.cli.results import add_command, add_yes, failed, say
 MAKE = """\
 Simulates the dataset of CONFIG.toml, shard by shard, into a folder or what fsspec opens. Ctrl-C and
 kill are safe at any moment, and the same command makes what is missing. Any number of processes may
-write into one folder: --part 2/8 makes every eighth shard from the second on, and no shard is made
-by two at a time."""
-
-SLURM = """\
-Writes a job array that makes a dataset in parts to the standard output, for `sbatch`, and its cost
-to the screen. Where some of it is made already, the array has the parts that are not."""
-
-EXPORT = """\
-Writes an MCAP log for every trajectory of a finished dataset that did not fail, for Foxglove and
-the like; `torchsoft identify` reads them. The documentation has recipes for LeRobot and The
-Well."""
-
-CLUSTER = 16
-"""Assumed number of workers of a cluster."""
+write into one folder: --part 2/8 makes every eighth shard from the second on."""
 
 MOST = 1000
 """Most local workers."""
@@ -39,38 +26,20 @@ HELP = "take fewer trajectories, a looser rtol or a shorter duration"
 
 def add_commands(commands: Any) -> None:
     """Add the command `dataset` and its subcommands."""
-    group = commands.add_parser("dataset", help="make datasets, check them, and give them away")
+    group = commands.add_parser("dataset", help="make datasets, and check them")
     own = group.add_subparsers(required=True, metavar="COMMAND")
 
     one = add_command(own, "make", make, "make a dataset, or a part of one", MAKE)
-    add_config(one)
+    one.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
+    one.add_argument("--out", required=True, help="folder or fsspec URL of the store")
     one.add_argument("--part", type=part, default=(1, 1), metavar="I/N", help="such as 2/8")
     workers = "threads, or processes if more than a few"
     one.add_argument("--workers", type=count, default=os.cpu_count() or 1, help=workers)
-    one.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
     add_yes(one)
-    one = add_command(
-        own, "slurm", slurm, "write the job array that makes a dataset in parts", SLURM
-    )
-    add_config(one)
-    one.add_argument("--parts", type=int, required=True, metavar="N", help="jobs of the array")
     one = add_command(
         own, "check", check, "read a dataset and say what is wrong with it", "One line a finding."
     )
     one.add_argument("store", help="folder or fsspec URL")
-    one.add_argument("--picture", type=Path, help="where to draw what the set covers")
-    one = add_command(
-        own, "export", export, "write the trajectories of a dataset as MCAP logs", EXPORT
-    )
-    one.add_argument("store", help="folder or fsspec URL")
-    one.add_argument("--to", choices=("mcap",), default="mcap", help="format of the logs")
-    one.add_argument("--out", type=Path, required=True, help="a new folder")
-
-
-def add_config(one: argparse.ArgumentParser) -> None:
-    """Add the arguments on the configuration and the place of the dataset."""
-    one.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
-    one.add_argument("--out", required=True, help="folder or fsspec URL of the store")
 
 
 def part(text: str) -> tuple[int, int]:
@@ -100,23 +69,17 @@ def make(options: argparse.Namespace) -> int:
     from torchsoft.datasets.reader import open_dataset
     from torchsoft.parallel import cores
 
-    workers = CLUSTER if options.scheduler else options.workers
-    at_once = CLUSTER if options.scheduler else min(workers, cores())
     try:
         config, mine = Config.from_toml(options.config), generate.Part(*options.part)
-        price = generate.estimate(config, options.out, at_once, mine)
+        price = generate.estimate(config, options.out, min(options.workers, cores()), mine)
         agree(price, options.yes, HELP)
         if price.seconds > BRIEF:
             say(price.sentence, error=True)
         if config.step is not None and config.step > COARSE:
             note = "is coarse: the energy balance may be off by percents"
             say(f"note: step = {config.step:g} s {note}", error=True)
-        with (
-            generate.dask_cluster(options.scheduler)
-            if options.scheduler
-            else generate.local_workers(workers)
-        ) as executor:
-            bad = generate.generate(config, options.out, executor, workers, part=mine)
+        with generate.local_workers(options.workers) as executor:
+            bad = generate.generate(config, options.out, executor, options.workers, part=mine)
     except BrokenProcessPool:
         failed("a worker was killed, perhaps for memory; start again to make what is missing")
         return 3
@@ -126,9 +89,6 @@ def make(options: argparse.Namespace) -> int:
         return 130
     made = sum(len(config.rows(shard)) for shard in mine.shards(config))
     left = generate.unfinished(config, options.out)
-    if elsewhere := [shard for shard in left if shard in mine.shards(config)]:
-        say(f"another process is making shards {listed(elsewhere)}")
-        made -= sum(len(config.rows(shard)) for shard in elsewhere)
     say(
         f"{made} trajectories in {options.out}; of those made now "
         + (f"{bad} failed, each with its reason" if bad else "none failed")
@@ -140,26 +100,8 @@ def make(options: argparse.Namespace) -> int:
     return 0
 
 
-def slurm(options: argparse.Namespace) -> int:
-    """Print a job array."""
-    from torchsoft.datasets.slurm import job_array
-
-    script, price = job_array(options.config, options.out, options.parts)
-    say(script.rstrip(), needed=True)
-    say(price, error=True)
-    return 0
-
-
 def check(options: argparse.Namespace) -> int:
     """Print the defects of a dataset; the exit status is 1 for any finding."""
     from torchsoft.datasets.check import report
 
-    return int(report(options.store, options.picture, say) > 0)
-
-
-def export(options: argparse.Namespace) -> int:
-    """Write a dataset as logs."""
-    from torchsoft.datasets.export import export_logs
-
-    say(export_logs(options.store, options.out))
-    return 0
+    return int(report(options.store, say) > 0)

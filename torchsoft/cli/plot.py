@@ -1,8 +1,6 @@
-"""The commands `plot` and `version`."""
+"""The command `plot`."""
 
 import argparse
-import platform
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ as wide as a page or a column, with --only for some of its panels."""
 
 
 def add_commands(commands: Any) -> None:
-    """Add the commands `plot` and `version`."""
+    """Add the command `plot`."""
     one = add_command(commands, "plot", plot, "draw a saved run", PLOT)
     one.add_argument("file", type=Path, metavar="FILE.nc", help="the run")
     one.add_argument("--html", action="store_true", help="write the interactive player")
@@ -30,8 +28,6 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--time", type=float, help="instant that is shown [s] (largest force)")
     one.add_argument("--title", default="", help="title (the file's name)")
     one.add_argument("--out", type=Path, help="folder for what is written (the file's)")
-    one = commands.add_parser("version", help="say which versions are at work")
-    one.set_defaults(run=versions)
 
 
 def plot(options: argparse.Namespace) -> int:
@@ -71,13 +67,4 @@ def plot(options: argparse.Namespace) -> int:
         written.append(made.with_name(f"{made.name}.png"))
         save(dashboard(run, title=title, **common), written[-1])
     say(f"written to {', '.join(map(str, written))}")
-    return 0
-
-
-def versions(options: argparse.Namespace) -> int:
-    """Print the versions of torchsoft and its main dependencies."""
-    names = ("torchsoft", "torch", "numpy", "numba")
-    listed = ", ".join(f"{name} {version(name)}" for name in names)
-    system = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
-    say(f"{listed}, {system}", needed=True)
     return 0

@@ -11,6 +11,7 @@ from torchsoft.datasets.distributions import Distribution, in_ratio
 from torchsoft.datasets.rig_files import differs, place
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.fields import at_field
 from torchsoft.rigs.initial import reference
 from torchsoft.rigs.places import unit
 from torchsoft.tables import line, shown
@@ -31,85 +32,66 @@ class Drawn(NamedTuple):
 
     def check(self, names: Iterable[str]) -> None:
         """Raises `ValueError` for parameters that are not numbers, or impossible together."""
-        for name in names:
+        for name in self.parameters:
             self._check_number(name)
         self._check_ends({*names})
 
     def _check_number(self, name: str) -> None:
         """Raises `ValueError` for a parameter that is not a number, or a ratio to something that is
         not."""
-        where, parameters = f"{self.where}parameters.{line(name, 80)}", self.parameters
-        if name in self.fixed:
-            raise ValueError(f"{where} is in `fixed` as well; leave one of them out")
-        try:
+        parameters = self.parameters
+        with at_field(f"{self.where}parameters.{line(name, 80)}"):
+            if name in self.fixed:
+                raise ValueError("it is in `fixed` as well; leave one of them out")
             _, value, field = place(self.file, name)
-        except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
-        if isinstance(value, int):
-            raise ValueError(f"{where} must be the same in every trajectory; set it in `fixed`")
-        word = isinstance(value, str) and unit(field)
-        if not (value is None or isinstance(value, float) or word):
-            raise ValueError(f"{where} is no number, but {shown(value)}")
-        base = parameters[name].ratio_to
-        if base is None:
-            return
-        own = f"{where}.ratio_to: {line(base, 80)}"
-        if base in parameters:
-            if base == name or parameters[base].ratio_to is not None:
-                raise ValueError(f"{own} is a ratio itself")
-            return
-        try:
-            of = place(self.file, base).value
-        except ValueError as error:
-            raise ValueError(f"{where}.ratio_to: {error}") from None
-        if not isinstance(of, float):
-            raise ValueError(f"{own} is no number, but {shown(of)}")
+            if isinstance(value, int):
+                raise ValueError("it must be the same in every trajectory; set it in `fixed`")
+            word = isinstance(value, str) and unit(field)
+            if not (value is None or isinstance(value, float) or word):
+                raise ValueError(f"it is no number, but {shown(value)}")
+            if (base := parameters[name].ratio_to) is None:
+                return
+            with at_field("ratio_to"):
+                if base in parameters and (base == name or parameters[base].ratio_to is not None):
+                    raise ValueError(f"{line(base, 80)} is a ratio itself")
+                of = 1.0 if base in parameters else place(self.file, base).value
+                if not isinstance(of, float):
+                    raise ValueError(f"{line(base, 80)} is no number, but {shown(of)}")
 
     def _check_ends(self, names: set[str]) -> None:
-        """Raises `ValueError` where bounds of the distributions with these names are impossible:
-        each bound alone, and pairs of bounds in one part or ratio; the other parameters are at
-        their medians."""
+        """Raises `ValueError` where the rig file is impossible: as it is; with each bound of the
+        distributions with these names, the other parameters as the file states them but for the
+        ratios that it is in; and with all parameters at their medians, or pairs of bounds in one
+        part or ratio and the others at their medians."""
         parameters, within = self.parameters, f"{self.where}parameters"
-        ends = {name: one.ends(f"{within}.{name}") for name, one in parameters.items()}
-        single = [{name: end} for name in parameters if name in names for end in ends[name].items()]
-        if self._impossible({}):
-            self._check_alone(single)
-            raise ValueError(f"{within} in their middle: {self._impossible({})}")
-        tables = {name: place(self.file, name).keys[:2] for name in parameters}
-        pairs = list[dict[str, tuple[str, float]]]()
-        for one, other in itertools.combinations(parameters, 2):
-            related = {parameters[one].ratio_to, parameters[other].ratio_to} & {one, other}
-            in_one_part = tables[one] == tables[other] and tables[one][0] != "motion"
-            if {one, other} & names and (related or in_one_part):
-                both = itertools.product(extremes(ends[one]), extremes(ends[other]))
-                pairs += [{one: end, other: end_of_other} for end, end_of_other in both]
-        for case in (*single, *pairs):
-            if reason := self._impossible(case):
-                raise ValueError(f"{stated(case)}: {reason}")
-
-    def _check_alone(self, single: list[dict[str, tuple[str, float]]]) -> None:
-        """Raises `ValueError` for the rig file itself, and for a bound that is impossible with the
-        other parameters as the file states them, but for the ratios that it is in."""
         if reason := self._unlike({}):
             raise ValueError(f"{f'{self.where}fixed' if self.where else 'rig'}: {reason}")
-        parameters = self.parameters
-        for case in sorted(single, key=lambda one: parameters[min(one)].ratio_to is None):
-            values, (name,) = self._values(case), case
-            base, tied = parameters[name].ratio_to, {name}
-            tied |= {one for one in parameters if one == base or parameters[one].ratio_to == name}
-            if reason := self._unlike({one: values[one] for one in tied}):
-                raise ValueError(f"{stated(case)}: {reason}")
+        ends = {name: one.ends(f"{within}.{name}") for name, one in parameters.items()}
+        tables = {name: place(self.file, name).keys[:2] for name in parameters}
+        for name in parameters.keys() & names:
+            related = {name, parameters[name].ratio_to}
+            related |= {one for one in parameters if parameters[one].ratio_to == name}
+            for end in ends[name].items():
+                values = self._values({name: end})
+                own = {one: values[one] for one in related & values.keys()}
+                if reason := self._unlike(own, moves=tables[name][0] == "motion"):
+                    raise ValueError(f"{stated({name: end})}: {reason}")
+        if reason := self._unlike(self._values({})):
+            raise ValueError(f"{within} in their middle: {reason}")
+        for one, other in itertools.combinations(parameters, 2):
+            ratio = {parameters[one].ratio_to, parameters[other].ratio_to} & {one, other}
+            in_one_part = tables[one] == tables[other] and tables[one][0] != "motion"
+            if {one, other} & names and (ratio or in_one_part):
+                for both in itertools.product(extremes(ends[one]), extremes(ends[other])):
+                    case = dict(zip((one, other), both))
+                    if reason := self._unlike(self._values(case)):
+                        raise ValueError(f"{stated(case)}: {reason}")
 
     def _values(self, case: Mapping[str, tuple[str, float]]) -> dict[str, float]:
         """All parameters, with those of a case at their bounds and the others at their medians."""
         middle = {name: one.at(MIDDLE) for name, one in self.parameters.items()}
         drawn = middle | {name: value for name, (_, value) in case.items()}
         return in_ratio(self.file, self.parameters, drawn)
-
-    def _impossible(self, case: Mapping[str, tuple[str, float]]) -> str | None:
-        """The reason why a case is impossible, None where it is not."""
-        moves = {place(self.file, name).keys[0] for name in case} == {"motion"}
-        return self._unlike(self._values(case), moves)
 
     def _unlike(self, values: Mapping[str, float], moves: bool = False) -> str | None:
         """The reason why the rig file cannot have these values: they are impossible, or change

@@ -1,14 +1,11 @@
-"""Validation of a dataset: read it again, list its defects, and draw its coverage."""
+"""Validation of a dataset: read it again, and list its defects."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib import rc_context
-from matplotlib.figure import Figure
 
 from torchsoft.datasets.card import by_split
 from torchsoft.datasets.config import Config
@@ -17,7 +14,6 @@ from torchsoft.datasets.files import (
     MANIFEST,
     Manifest,
     StoreError,
-    check_apart,
     filesystem,
     keys,
     listed,
@@ -25,16 +21,11 @@ from torchsoft.datasets.files import (
 )
 from torchsoft.datasets.generate import points
 from torchsoft.datasets.reader import Vouched, open_dataset
-from torchsoft.datasets.subject import SPLITS
 from torchsoft.files import PARTIAL
-from torchsoft.plot.figures import STYLE, new_figure, save
 from torchsoft.tables import line
 
 MANY = 0.5
 """Share of trajectories that failed from which a set is called wrong."""
-
-MOST = 5
-"""Most trajectories whose channels are in the picture."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -208,57 +199,17 @@ def summary(url: str, data: xr.Dataset) -> str:
     )
 
 
-@rc_context(STYLE)
-def figure(data: xr.Dataset, config: Config) -> Figure:
-    """Coverage of a dataset: each drawn parameter over the next one by split, with failures
-    crossed, and up to three channels of some sound trajectories over time."""
-    drawn, series = config.parameters, list(config.subject.channels)[:3]
-    columns = min(4, len(drawn) + len(series))
-    rows = -(-(len(drawn) + len(series)) // columns)
-    failed = data.failed.values.astype(bool)
-    title = f"{config.title}: {len(failed)} trajectories, {failed.sum()} failed"
-    picture = new_figure(title, 13, 11.6 / columns * rows)
-    panels = picture.subplots(rows, columns, squeeze=False).ravel()
-    following = dict(zip(drawn, [*list(drawn)[1:], *drawn]))
-    for axes, (x, y) in zip(panels, following.items()):
-        for split in SPLITS:
-            some = data.isel(trajectory=~failed & (data.split.values == split))
-            axes.plot(some[x], some[y], ".", label=split)
-        axes.plot(data[x][failed], data[y][failed], "x", label="failed")
-        axes.set(xscale=drawn[x].scale, yscale=drawn[y].scale)
-        axes.set(xlabel=f"{x} [{data[x].units}]", ylabel=f"{y} [{data[y].units}]")
-    for axes, name in zip(panels[len(drawn) :], series):
-        axes.plot(data.time, data[name][np.flatnonzero(~failed)[:MOST]].T, lw=0.7)
-        axes.set(xlabel="time [s]", ylabel=f"{name} [{data[name].units}]")
-    for axes in panels[len(drawn) + len(series) :]:
-        axes.set_axis_off()
-    if drawn:
-        keys = panels[0].get_legend_handles_labels()
-        picture.legend(*keys, loc="outside upper right", ncols=4)
-    return picture
-
-
-def report(url: str, picture: Path | None = None, say: Callable[[str], None] = print) -> int:
-    """Say every finding, sizes and counts; how many findings there are.
-    Raises `ValueError` for a picture in the dataset itself."""
-    if picture is not None:
-        check_apart(url, "--picture", picture)
+def report(url: str, say: Callable[[str], None] = print) -> int:
+    """Say every finding, sizes and counts; how many findings there are."""
     found = list[str]()
     for finding in check(url):
         say(finding)
         found.append(finding)
     try:
-        data = open_dataset(url, unfinished=True)
-        say(summary(url, data))
-        if picture is not None:
-            config = Config.model_validate(Manifest.read(url).config)
-            save(figure(data, config), picture, dpi=120)
-            say(f"picture in {picture}")
-    except (
-        Exception
-    ) as error:  # a damaged store has been reported above; the picture must not hide it
+        say(summary(url, open_dataset(url, unfinished=True)))
+    except Exception as error:  # a damaged store has been reported above
         if str(error) not in found:
-            found.append(line(f"no summary or picture: {type(error).__name__}: {error}"))
+            found.append(line(f"no summary: {type(error).__name__}: {error}"))
             say(found[-1])
     say(f"{len(found)} finding{'s' * (len(found) > 1)}" if found else "sound")
     return len(found)

@@ -48,8 +48,6 @@ class Fields(Table):
     """what a worker makes at once, what its memory holds, and what a file of an array holds"""
     samples_per_chunk: int = Field(250, ge=1, le=10_000_000)
     """of one trajectory, read and decompressed at once"""
-    method: Literal["sobol", "latin_hypercube"] = "sobol"
-    """design of what is drawn; a longer Sobol sequence begins with the shorter one"""
     duration: float = Field(ge=1e-3, le=1e4)
     """of every trajectory [s]; that of the rig file by default"""
     sample_interval: float = Field(5e-3, ge=1e-6, le=1.0)

@@ -226,12 +226,6 @@ def listed(shards: Iterable[int]) -> str:
     return ", ".join(some if len(some) <= MOST else [*some[:MOST], "..."])
 
 
-def check_apart(url: str, field: str, path: Path) -> None:
-    """Raises `ValueError` for a path within a dataset, which holds its own files only."""
-    if (here := folder(url)) and path.resolve().is_relative_to(here.resolve()):
-        raise ValueError(f"{field}: {path} lies in the dataset {url}; name a place outside of it")
-
-
 def record_key(shard: int) -> str:
     """The key of a shard's record."""
     return RECORD.replace("{shard}", str(shard))

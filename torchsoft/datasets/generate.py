@@ -1,16 +1,15 @@
 """Generation of a dataset, or of one part. A second run on the same folder makes the missing
 shards.
 
-Each part has shards of its own, and no two processes make one shard at the same time.
+Each part has shards of its own.
 """
 
 import math
 import statistics
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from tqdm import tqdm
 from torchsoft.cost import Cost, rig_row, rig_step, steps_per_second
 from torchsoft.datasets.card import write_card
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, read_bytes
+from torchsoft.datasets.files import MANIFEST, Manifest, read_bytes
 from torchsoft.datasets.schema import energies, surfaces
 from torchsoft.datasets.subject import Row, Subject, Task
 from torchsoft.datasets.writer import Store, open_or_create
@@ -40,16 +39,11 @@ COUNTS = ("steps", "newton_iterations")
 
 
 def points(config: Config) -> NDArray[np.floating]:
-    """The design in the unit cube, shape (trajectories, dimensions).
-
-    A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to
-    its size.
-    """
-    dimensions, rng = config.subject.dimensions, np.random.default_rng(config.seed)
-    if config.method == "latin_hypercube":
-        return qmc.LatinHypercube(dimensions, rng=rng).random(config.trajectories)
+    """The design in the unit cube, shape (trajectories, dimensions): a Sobol sequence, which is a
+    prefix of every longer one of the same seed."""
+    sobol = qmc.Sobol(config.subject.dimensions, rng=np.random.default_rng(config.seed))
     power = int(np.ceil(np.log2(config.trajectories)))
-    return qmc.Sobol(dimensions, scramble=True, rng=rng).random_base2(power)[: config.trajectories]
+    return sobol.random_base2(power)[: config.trajectories]
 
 
 def simulate_task(config: Config, task: Task) -> Row:
@@ -163,16 +157,9 @@ def unfinished(config: Config, url: str, part: Part = WHOLE) -> list[int]:
     return [shard for shard in part.shards(config) if shard not in finished]
 
 
-class Each(NamedTuple):
-    """One trajectory: its least and longest time [s], and its steps."""
-
-    least: float
-    longest: float
-    steps: float
-
-
-def cost(config: Config, workers: int, each: Each | None = None) -> Cost:
-    """Cost of the whole set on `workers` workers, by default by experience."""
+def cost(config: Config, workers: int, each: Cost | None = None) -> Cost:
+    """Cost of the whole set on `workers` workers, from the times of a trajectory, by default by
+    experience."""
     subject, count = config.subject, config.trajectories
     at_once = max(min(workers, config.shards), 1)
     one = usual(config) if each is None else each
@@ -183,14 +170,14 @@ def cost(config: Config, workers: int, each: Each | None = None) -> Cost:
     design = 8 * 2 * count * subject.dimensions / 2**30
     return Cost(
         steps=count * one.steps,
-        seconds=count * one.longest / at_once,
+        seconds=count * one.seconds / at_once,
         least=count * one.least / at_once,
         memory=design + shard * at_once,
         disk=kept * count,
     )
 
 
-def usual(config: Config) -> Each:
+def usual(config: Config) -> Cost:
     """A trajectory by experience, on the high side."""
     subject = config.subject
     duration, step = config.duration, subject.steps.get("step")
@@ -200,10 +187,10 @@ def usual(config: Config) -> Each:
         rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
         steps = duration * steps_per_second(rtol) + 0.5 * config.samples
     seconds = steps * rig_step(subject.template) + STATICS
-    return Each(seconds, seconds, steps)
+    return Cost(steps, seconds, 0.0, least=seconds)
 
 
-def measured(config: Config) -> Each:
+def measured(config: Config) -> Cost:
     """A trajectory by the first ones of the set. One run before them loads the kernels; the times
     are of the processor, which other programs hardly change."""
     design, times, steps = points(config), list[float](), list[int]()
@@ -213,14 +200,14 @@ def measured(config: Config) -> Each:
             steps.append(simulate_task(config, config.subject.task(i, design[i]))["steps"])
             times.append(time.thread_time() - began)
     mean, error = statistics.mean(times[1:]), SURE * statistics.stdev(times[1:]) / TRIED**0.5
-    return Each(max(mean - error, 0.0), mean + error, statistics.mean(steps[1:]))
+    return Cost(statistics.mean(steps[1:]), mean + error, 0.0, least=max(mean - error, 0.0))
 
 
 def estimate(config: Config, url: str, workers: int, part: Part = WHOLE) -> Cost:
     """Cost of the unfinished shards of a part; a few trajectories are timed where there are
     many."""
     count = sum(len(config.rows(shard)) for shard in unfinished(config, url, part))
-    tried = count >= MANY and (TRIED + 1) * usual(config).longest < PATIENCE
+    tried = count >= MANY and (TRIED + 1) * usual(config).seconds < PATIENCE
     whole = cost(config, workers, measured(config) if tried else None)
     return whole.part(count / config.trajectories)
 
@@ -236,13 +223,11 @@ class Serial(Executor):
 
 def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
     """Simulate and write one shard. Returns how many of its trajectories are finished and how many
-    of those simulated here failed, (0, 0) where another process makes the shard."""
+    of those simulated here failed."""
     config = store.config
-    with store.claim(shard) as mine, single_threaded():
-        if not mine:
-            return 0, 0
-        if store.finished(shard):  # by another process, since it was submitted
-            return len(config.rows(shard)), 0
+    if store.finished(shard):  # by another process, since it was submitted
+        return len(config.rows(shard)), 0
+    with single_threaded():
         tasks = zip(config.rows(shard), design, strict=True)
         rows = [simulate_task(config, config.subject.task(i, u)) for i, u in tasks]
         store.write(shard, rows)
@@ -253,8 +238,8 @@ def generate(
     config: Config, url: str, executor: Executor, workers: int = 1, progress: bool = True,
     part: Part = WHOLE,
 ) -> int:  # fmt: skip
-    """Make every unfinished shard of a part at `url`, but for those that other processes are
-    making, and the set's card once all are finished; the number of failed simulations among them.
+    """Make every unfinished shard of a part at `url`, and the set's card once all are finished; the
+    number of failed simulations among them.
 
     At most a few shards a worker are submitted at a time, so that Ctrl-C is heard and memory is
     bounded. Raises `StoreError`, and `ValueError` for a part that has no shard.
@@ -296,14 +281,3 @@ def local_workers(workers: int) -> AbstractContextManager[Executor]:
     if workers > THREADS:
         return local_processes(workers)
     return executor(workers) if workers else Serial()
-
-
-@contextmanager
-def dask_cluster(address: str) -> Iterator[Executor]:
-    """An existing Dask cluster as an executor; shards of a lost worker go to the others."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise StoreError("--scheduler needs Dask: pip install 'torchsoft[scale]'") from None
-    with Client(address) as client:
-        yield client.get_executor(retries=3, pure=False)

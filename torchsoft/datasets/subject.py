@@ -22,6 +22,7 @@ from torchsoft.datasets.fields import Fields
 from torchsoft.datasets.rig_files import place
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.fields import at_field
 from torchsoft.tables import line
 
 RTOL = 1e-4
@@ -78,10 +79,8 @@ class Subject:
         outputs = {
             "duration": config.duration, "interval": config.sample_interval, "snapshots": (),
         }  # fmt: skip
-        try:
+        with at_field("rig"):
             file = RigFile.from_tree(config.rig, self._folder).override(outputs=outputs)
-        except ValueError as error:
-            raise ValueError(f"rig: {error}") from None
         return with_fixed(file, config.fixed, "fixed")
 
     @cached_property
@@ -98,10 +97,8 @@ class Subject:
     def template(self) -> Rig:
         """A rig with the parts and meshes that all trajectories share."""
         file = self.file  # which names the field of its own errors
-        try:
+        with at_field("rig"):
             return file.assemble()
-        except ValueError as error:
-            raise ValueError(f"rig: {error}") from None
 
     @cached_property
     def variables(self) -> dict[str, schema.Variable]:
@@ -186,18 +183,16 @@ class Subject:
             config.parameters
         )
         for kind, drawn in zip(config.kinds, self.kinds):
-            drawn.check([*kind.parameters, *(kind.fixed.keys() & config.parameters)])
+            drawn.check(kind.parameters)
         self.variables  # noqa: B018 -- raises
 
 
 def with_fixed(file: RigFile, fixed: Mapping[str, Any], where: str) -> RigFile:
     """The rig file with these values set. Raises `ValueError`."""
     for name, value in fixed.items():
-        try:
+        with at_field(f"{where}.{line(name, 80)}"):
             place(file, name)
             file = file.override({name: value})
-        except ValueError as error:
-            raise ValueError(f"{where}.{line(name, 80)}: {error}") from None
     return file
 
 

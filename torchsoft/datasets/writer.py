@@ -3,8 +3,6 @@ data."""
 
 import subprocess
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -33,7 +31,7 @@ from torchsoft.datasets.files import (
     write_bytes,
 )  # fmt: skip
 from torchsoft.datasets.schema import coordinates
-from torchsoft.files import PARTIAL, claimed, finite, remove_partials
+from torchsoft.files import PARTIAL, finite, remove_partials
 
 SMALL = (ZstdCodec(level=3), Crc32cCodec())
 LARGE = (BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec())
@@ -62,18 +60,6 @@ class Store:
         fs, root = filesystem(self.url)
         needed = record_key(shard), *self.manifest.layout.of(shard)
         return all(fs.exists(f"{root}/{key}") for key in needed)
-
-    @contextmanager
-    def claim(self, shard: int) -> Iterator[bool]:
-        """Whether a shard is claimed for this process: no other process makes it. Object stores,
-        and file systems without locks, let several processes claim one shard; they write the same
-        content."""
-        if here := folder(self.url):
-            partial = here / f"{record_key(shard)}.{0:016}.partial"
-            with store_errors(self.url), claimed(partial) as mine:
-                yield mine
-        else:
-            yield True
 
     def write(self, shard: int, rows: list[dict[str, Any]]) -> None:
         """Write a whole shard, then its record. Raises `StoreError` when there is no room or no

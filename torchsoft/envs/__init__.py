@@ -14,9 +14,9 @@ gymnasium = needed("gymnasium", "learn")
 
 # these need gymnasium
 from torchsoft.envs.dynamics import Dynamics, Moment, TargetPose, Transition  # noqa: E402
-from torchsoft.envs.rig_env import RigEnv, RigVectorEnv  # noqa: E402
+from torchsoft.envs.rig_env import RigEnv  # noqa: E402
 
-__all__ = ["Dynamics", "Moment", "RigEnv", "RigVectorEnv", "TargetPose", "Transition", "reorient"]
+__all__ = ["Dynamics", "Moment", "RigEnv", "TargetPose", "Transition", "reorient"]
 
 
 RIG = Path(__file__).with_name("reorient.toml")
@@ -40,13 +40,4 @@ def reorient(**changes: Any) -> RigEnv:
     return RigEnv(**stated | changes)
 
 
-def reorient_vector(num_envs: int, **changes: Any) -> RigVectorEnv:
-    """Vector of `num_envs` of these environments, in threads."""
-    return RigVectorEnv([lambda: reorient(**changes)] * num_envs)
-
-
-gymnasium.register(
-    "torchsoft/Reorient-v0",
-    entry_point="torchsoft.envs:reorient",
-    vector_entry_point="torchsoft.envs:reorient_vector",
-)
+gymnasium.register("torchsoft/Reorient-v0", entry_point="torchsoft.envs:reorient")

@@ -1,18 +1,14 @@
-"""A rig file as an environment of gymnasium; vectors of environments, and their pictures."""
+"""A rig file as an environment of gymnasium, and its pictures."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.vector.utils import iterate
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -28,8 +24,7 @@ from torchsoft.envs.dynamics import (
     check_names,
     checked,
 )
-from torchsoft.parallel import cores, executor, parallel_map
-from torchsoft.physics.arguments import number, whole
+from torchsoft.physics.arguments import number
 from torchsoft.plot.scene import Instant, Scene, instants, limits
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
@@ -280,78 +275,6 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def close(self) -> None:
         """Forget the limits of the pictures."""
         self._scene = None
-
-
-# Vectors of environments in threads.
-
-
-class RigVectorEnv(SyncVectorEnv):
-    """Environments whose steps and resets run in `threads` threads, by default one for each core.
-    Results do not depend on the number of threads.
-
-    Only one thread at a time computes in Python, which is about half of a short step; where that
-    counts, gymnasium's `AsyncVectorEnv` takes processes.
-    """
-
-    def __init__(
-        self, make: Sequence[Callable[[], RigEnv]], *, threads: int | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    ) -> None:  # fmt: skip
-        if not make:
-            raise ValueError("`make` must hold one function an environment, but is empty")
-        threads = cores() if threads is None else whole("threads", threads, 1)
-        super().__init__(make, autoreset_mode=autoreset_mode)
-        self._threads = min(threads, len(make))
-
-    @cached_property
-    def _pool(self) -> ThreadPoolExecutor:
-        return executor(self._threads)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the threads: a copy has threads of its own."""
-        return {name: value for name, value in vars(self).items() if name != "_pool"}
-
-    def step(self, actions: Any) -> Any:
-        """Step all environments, as gymnasium's `SyncVectorEnv` does."""
-        every, todo = self.envs, list(iterate(self.action_space, actions))
-        again = self.autoreset_mode is AutoresetMode.NEXT_STEP
-
-        def work(i: int) -> _Done:
-            if again and self._autoreset_envs[i]:
-                return _Done(None, every[i].reset())
-            stepped = every[i].step(todo[i])
-            over = (stepped[2] or stepped[3]) and self.autoreset_mode is AutoresetMode.SAME_STEP
-            return _Done(stepped, every[i].reset() if over else None)
-
-        def share(k: int) -> dict[int, _Done]:
-            return {i: work(i) for i in range(k, len(every), self._threads)}
-
-        done: dict[int, _Done] = {}
-        for _, some in parallel_map(share, self._threads, turns=True, pool=self._pool):
-            done |= some
-        try:
-            self.envs = [done[i] for i in range(len(every))]  # pyright: ignore[reportAttributeAccessIssue]
-            return super().step(actions)
-        finally:
-            self.envs = every
-
-    def close_extras(self, **options: Any) -> None:
-        """End the threads and the environments."""
-        self._pool.shutdown()
-        super().close_extras(**options)
-
-
-class _Done(NamedTuple):
-    """Results of an environment, in the interface of an environment."""
-
-    stepped: Any
-    begun: Any
-
-    def step(self, _: Any) -> Any:
-        return self.stepped
-
-    def reset(self, **_: Any) -> Any:
-        return self.begun
 
 
 ROOM = 0.25

@@ -1,12 +1,13 @@
 """Motions with movable knots: bounds, and variables of a search."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
+from scipy.linalg import block_diag
 from scipy.optimize import linprog
 from torch import Tensor
 
@@ -35,15 +36,10 @@ class Range(Table):
 
 class Bounds(Range):
     """Bounds of a signal of the reference: values from `low` to `high` [its unit], at `speed` [its
-    unit/s] at most.
-
-    Knots later than `after` [s] are free. Their times are free too if `shortest` [s] is given, the
-    least time between two.
-    """
+    unit/s] at most. The values of knots later than `after` [s] are free."""
 
     speed: float = Field(gt=0)
     after: float = 0.0
-    shortest: float | None = Field(default=None, gt=0)
 
 
 def profile(reference: Reference, name: str) -> Profile:
@@ -78,110 +74,76 @@ def knots(reference: Reference, names: Iterable[str]) -> dict[str, Any]:
     }
 
 
+class FreeKnots(NamedTuple):
+    """Knots of a signal: times [s] and values (k,), of which those from number `first` on are free,
+    and how far the speed lets each free one be from the one before."""
+
+    times: Array
+    values: Array
+    first: int
+    reach: Array
+
+
 class Moves:
-    """The variables z (n,) of a motion: values, and times where these are free, of the free knots
-    of some signals, which end by `end` [s]; none for empty `bounds`. Each is over a unit of its
-    own: the largest distance that the speed allows between two knots, or the time between them.
+    """The variables z (n,) of a motion: values of the free knots of some signals, which end by
+    `end` [s]; none for empty `bounds`. Each is over a unit of its own, the largest distance that
+    the speed allows between two knots. `ways` (n, n) makes distances between knots of them, and A z
+    <= b keeps bounds and speed.
 
     Raises `ValueError` for signals without free knots, and for bounds that no motion of these knots
     can keep.
     """
 
     def __init__(self, reference: Reference, bounds: Mapping[str, Bounds], end: float) -> None:
-        self.given, self.bounds, self.end = reference, dict(bounds), end
-        self.knots: dict[str, tuple[Array, Array, int]] = {}  # times, values, the first free one
-        units, z = [np.zeros(0)], [np.zeros(0)]
-        for name, one in bounds.items():
-            signal = profile(reference, name)
-            times, values = signal.times.numpy(), signal.values.detach().numpy()
-            first = int(np.searchsorted(times, one.after, side="right"))
-            if first == len(times):
-                raise ValueError(f"`{name}` has no knot after {one.after:g} s that could move")
-            if first == 0 or times[-1] > end * (1 + 1e-9):
-                raise ValueError(
-                    f"`{name}` must have a knot at or before after = {one.after:g} s that stays, "
-                    f"and none beyond the end, {end:g} s; it has knots at "
-                    f"{', '.join(f'{t:g}' for t in times)} s: change `after`, or the motion"
-                )
-            self.knots[name] = times, values, first
-            spans = np.diff(times[first - 1 :])
-            units.append(np.minimum(one.speed * spans / PEAK, one.high - one.low))
-            z.append(values[first:])
-            if one.shortest is not None:
-                units.append(spans)
-                z.append(times[first:])
-        self.unit, flat = np.concatenate(units), np.concatenate(z)
-        self.n, origin = len(flat), self._excess(np.zeros(len(flat)))
-        columns = [self._excess(e) - origin for e in np.eye(self.n)]  # excess is affine in z
-        self.A = np.array(columns).reshape(self.n, len(origin)).T
-        self.b = -origin
-        self.start = self.nearest(flat / self.unit)
-
-    def split(self, z: Any) -> dict[str, tuple[Any, Any]]:
-        """Times and values of the free knots by signal, from z, as arrays or tensors."""
-        physical, out, at = (
-            z * (torch.from_numpy(self.unit) if isinstance(z, Tensor) else self.unit),
-            {},
-            0,
+        self.given, self.bounds = reference, dict(bounds)
+        self.knots = {
+            name: free_knots(profile(reference, name), name, one, end)
+            for name, one in bounds.items()
+        }
+        A, b, units, flat, ways = (
+            [np.zeros((0, 0))],
+            [np.zeros(0)],
+            [np.zeros(0)],
+            [np.zeros(0)],
+            [],
         )
-        for name, (times, _, first) in self.knots.items():
-            count = len(times) - first
-            values, at = physical[at : at + count], at + count
-            moved = times[first:]
-            if self.bounds[name].shortest is not None:
-                moved, at = physical[at : at + count], at + count
-            out[name] = moved, values
-        return out
+        for one, (_, values, first, reach) in zip(bounds.values(), self.knots.values()):
+            k = len(reach)
+            unit, way = np.minimum(reach, one.high - one.low), np.eye(k) - np.eye(k, k=-1)
+            before = np.append(values[first - 1], np.zeros(k - 1))
+            A.append(np.concatenate((np.eye(k), -np.eye(k), way, -way)) * unit)
+            b += [np.full(k, one.high), np.full(k, -one.low), reach + before, reach - before]
+            ways.append(way * unit / unit[:, None])
+            units.append(unit)
+            flat.append(values[first:])
+        self.unit = np.concatenate(units)
+        self.n = len(self.unit)
+        self.A: Array = np.asarray(block_diag(*A))
+        self.ways: Array = np.asarray(block_diag(*ways))
+        self.b = np.concatenate(b)
+        self.start = self.nearest(np.concatenate(flat) / self.unit)
 
-    def ways(self) -> Array:
-        """Matrix (n, n) from the variables to the distances between knots, and the times."""
-        D, at = np.eye(self.n), 0
-        for name, (times, _, first) in self.knots.items():
-            count = len(times) - first
-            rows = np.arange(at + 1, at + count)
-            D[rows, rows - 1] = -self.unit[rows - 1] / self.unit[rows]
-            at += count if self.bounds[name].shortest is None else 2 * count
-        return D
+    def values(self, z: Tensor) -> dict[str, Tensor]:
+        """Values of the free knots by signal."""
+        counts = [len(one.reach) for one in self.knots.values()]
+        return dict(zip(self.knots, (z * torch.from_numpy(self.unit)).split(counts)))
 
     def box(self) -> list[tuple[float, float]]:
         """Lower and upper bound of every variable."""
-        out, at = list[tuple[float, float]](), 0
-        for name, (times, _, first) in self.knots.items():
-            one, count = self.bounds[name], len(times) - first
-            ranges = [(one.low, one.high)]
-            if one.shortest is not None:
-                ranges.append((float(times[first - 1]), self.end))
-            for low, high in ranges:
-                out += [(low / unit, high / unit) for unit in self.unit[at : at + count]]
-                at += count
-        return out
+        ends = [
+            (one.low, one.high) for name, one in self.bounds.items() for _ in self.knots[name].reach
+        ]
+        return [(low / unit, high / unit) for (low, high), unit in zip(ends, self.unit)]
 
     def reference(self, z: Tensor, given: Reference | None = None) -> Reference:
         """The motion, by default of the given reference, with the free knots z, differentiable with
         respect to z."""
         signals = dict[str, Profile]()
-        for name, (times, values) in self.split(z).items():
-            known_times, known_values, first = self.knots[name]
-            moved = times if isinstance(times, Tensor) else torch.from_numpy(times)
-            signals[name] = Profile(
-                torch.cat((torch.from_numpy(known_times[:first]), moved)),
-                torch.cat((torch.from_numpy(known_values[:first]), values)),
-            )
+        for name, moved in self.values(z).items():
+            times, values, first, _ = self.knots[name]
+            known = torch.from_numpy(values[:first])
+            signals[name] = Profile(torch.from_numpy(times), torch.cat((known, moved)))
         return (self.given if given is None else given).replaced(signals)
-
-    def _excess(self, z: Array) -> Array:
-        """Excess over the constraints, not positive where they are kept: bounds of values, speed,
-        `shortest` and the end."""
-        rows = [np.zeros(0)]
-        for name, (times, values) in self.split(z).items():
-            one, (known_times, known_values, first) = self.bounds[name], self.knots[name]
-            t = np.concatenate((known_times[first - 1 : first], times))
-            v = np.concatenate((known_values[first - 1 : first], values))
-            way, span = np.diff(v), np.diff(t) * one.speed / PEAK
-            rows += [(v[1:] - one.high), (one.low - v[1:]), way - span, -way - span]
-            if one.shortest is not None:
-                rows += [one.shortest - np.diff(t), t[-1:] - self.end]
-        return np.concatenate(rows)
 
     def nearest(self, z: Array) -> Array:
         """The nearest z within the bounds, by the sum of absolute changes. Raises `ValueError`
@@ -206,18 +168,31 @@ class Moves:
     def active(self, z: Array) -> list[str]:
         """Active bounds of a motion, with the number of their knots, in words."""
         out = []
-        for name, (times, values) in self.split(z).items():
-            one, (known_times, known_values, first) = self.bounds[name], self.knots[name]
-            way = np.diff(np.append(known_values[first - 1], values))
-            span: Array = np.ediff1d(np.append(known_times[first - 1], times)).astype(
-                np.float64
-            ) * (one.speed / PEAK)
+        for name, moved in self.values(torch.from_numpy(z)).items():
+            one, (_, known, first, reach) = self.bounds[name], self.knots[name]
+            values = moved.numpy()
+            way = np.diff(values, prepend=known[first - 1])
             near = 1e-3 * (one.high - one.low)
             for limit, count in (
                 (f"low = {one.low:g}", int(np.sum(values < one.low + near))),
                 (f"high = {one.high:g}", int(np.sum(values > one.high - near))),
-                (f"speed = {one.speed:g}", int(np.sum(np.abs(way) > 0.99 * span))),
+                (f"speed = {one.speed:g}", int(np.sum(np.abs(way) > 0.99 * reach))),
             ):
                 if count:
                     out.append(f"{name} at {limit} in {count} of {len(values)} knots")
         return out
+
+
+def free_knots(signal: Profile, name: str, bounds: Bounds, end: float) -> FreeKnots:
+    """The knots of a signal. Raises `ValueError` where none is free, or none before them stays."""
+    times, values = signal.times.numpy(), signal.values.detach().numpy()
+    first = int(np.searchsorted(times, bounds.after, side="right"))
+    if first == len(times):
+        raise ValueError(f"`{name}` has no knot after {bounds.after:g} s that could move")
+    if first == 0 or times[-1] > end * (1 + 1e-9):
+        raise ValueError(
+            f"`{name}` must have a knot at or before after = {bounds.after:g} s that stays, "
+            f"and none beyond the end, {end:g} s; it has knots at "
+            f"{', '.join(f'{t:g}' for t in times)} s: change `after`, or the motion"
+        )
+    return FreeKnots(times, values, first, bounds.speed * np.diff(times[first - 1 :]) / PEAK)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -34,7 +34,6 @@ POLISH = 0.1
 """Relative tolerance of a second search, over that of the first, where the check fails."""
 
 Method = Literal["slsqp", "adam"]
-Robust = Literal["mean", "worst"]
 
 
 @dataclass(frozen=True, repr=False)
@@ -93,7 +92,7 @@ def plan(
     targets: Mapping[str, Term] | None = None, limits: Mapping[str, Term] | None = None,
     y0: Numbers | Start, reference: Reference | None = None,
     over: Mapping[str, Numbers] | None = None,
-    robust: Robust = "mean", method: Method = "slsqp", iterations: int = 50, rate: float = 0.02,
+    method: Method = "slsqp", iterations: int = 50, rate: float = 0.02,
     starts: int = 1, seconds: float = float("inf"), rtol: float = RTOL, seed: int = 0,
     progress: bool = False,
 ) -> Plan:  # fmt: skip
@@ -109,9 +108,9 @@ def plan(
     given, by half the squared change of the variables in units of the speed or range allowed.
 
     `over` holds draws of uncertain parameters by name (draws, ...), y0 their starts (draws, size)
-    if these differ, the first draw being the nominal one. With `robust` "mean" the mean error of
-    every target is brought to zero, and the spread of errors lowered with the objective's mean;
-    with "worst" the worst draw is. Limits are kept in every draw.
+    if these differ, the first draw being the nominal one. The mean error of every target is brought
+    to zero, and the spread of errors lowered with the objective's mean. Limits are kept in every
+    draw.
 
     "slsqp" takes up to `iterations` steps of sequential quadratic programming; "adam" as many
     steps of Adam at `rate`, projected onto the bounds, with squared errors and excess as a price:
@@ -122,12 +121,8 @@ def plan(
     Raises `ValueError` for arguments that do not fit together, and where no start can be run.
     """
     t, y0 = tensor("t", t), y0 if callable(y0) else tensor("y0", y0)
-    for name, given, known in (
-        ("method", method, ("slsqp", "adam")),
-        ("robust", robust, ("mean", "worst")),
-    ):
-        if given not in known:
-            raise ValueError(f"`{name}` must be one of {', '.join(known)}, not {given!r}")
+    if method not in get_args(Method):
+        raise ValueError(f"`method` must be one of {', '.join(get_args(Method))}, not {method!r}")
     whole("iterations", iterations, 1)
     whole("starts", starts, 1)
     if objective is None and not targets:
@@ -140,7 +135,7 @@ def plan(
     change = 1.0 if objective is None else 0.0
     notices, checked = list[str](), None
     with tqdm(desc="plan", unit=" evaluations", disable=hidden(progress)) as bar:
-        criterion = Criterion(variables, robust == "worst", change)
+        criterion = Criterion(variables, change)
         search = Search(evaluator, criterion, seconds, bar)
         try:
             search.begin(starts, seed)
@@ -163,7 +158,7 @@ def plan(
             f"{len(search.failures)} plans could not be run, the first: {search.failures[0]}"
         )
     return finished(search, checked, rig, notices, {
-        "torchsoft": version("torchsoft"), "method": method, "robust": robust,
+        "torchsoft": version("torchsoft"), "method": method,
         "free": {k: tuple(v) if isinstance(v, tuple) else v.model_dump() for k, v in free.items()},
         "draws": evaluator.draws, "iterations": iterations, "starts": starts, "rtol": rtol,
         "seed": seed,
@@ -212,10 +207,9 @@ def finished(
             planned.parameter(name).copy_(value)
     start = started(planned, start, "none") if callable(start) else start
     planned.reference = reference = variables.reference(now, start.reference)
-    combined = evaluation.value.max() if search.criterion.worst else evaluation.value.mean()
     return Plan(
         rig=planned, reference=reference, parameters=parameters, trajectory=run,
-        value=float(combined),
+        value=float(evaluation.value.mean()),
         errors=errors, excess=excess, reached=bool(held[0]), holds=float(held.mean()),
         reasons=tuple(reasons), notices=tuple(notices), history=tuple(search.history),
         made_by=made_by | {

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.plan.knots import Array, Bounds, Moves
+from torchsoft.plan.knots import Array, Bounds, Moves, Range
 from torchsoft.solve.batch import Batch, own_values, simulate_batch
 from torchsoft.solve.simulate import Initial, Start, started
 from torchsoft.solve.trajectory import Trajectory
@@ -115,7 +115,7 @@ def evaluated(terms: Mapping[str, Term], run: Trajectory, field: str) -> dict[st
 # Free variables of a plan: knots of motions, and parameters of a rig of any shape.
 
 
-Free = Mapping[str, Bounds | tuple[float, float]]
+Free = Mapping[str, Bounds | Range | tuple[float, float]]
 """Bounds of a motion's knots by its name, or lower and upper bound of a parameter by its name."""
 
 
@@ -139,7 +139,7 @@ class Variables:
             if isinstance(one, Bounds):
                 continue
             value = rig.parameter(name).detach()
-            least, most = one
+            least, most = (one.low, one.high) if isinstance(one, Range) else one
             if not least < most:
                 raise ValueError(f"free.{name} = ({least:g}, {most:g}): low must be below high")
             if not bool(((value >= least) & (value <= most)).all()):
@@ -163,7 +163,7 @@ class Variables:
         self.high = np.concatenate([unbounded, *high])
         # D z holds the ways between knots, so that a small change of it is a smooth one
         self.D = np.eye(self.n)
-        self.D[: self.moves.n, : self.moves.n] = self.moves.ways()
+        self.D[: self.moves.n, : self.moves.n] = self.moves.ways
         # A z <= b keeps knots within their bounds
         self.A = np.pad(self.moves.A, ((0, 0), (0, self.n - self.moves.n)))
         self.b = self.moves.b

@@ -67,13 +67,11 @@ class Stopped(Exception):
 
 
 class Criterion:
-    """What a search minimises within targets and limits. With one draw, or unless `worst`, it is
-    the mean of the objective and the spread of the errors, while the mean errors of the draws are
-    brought to zero; the `worst` draw is that of the largest sum of the objective and half the
-    squared errors."""
+    """What a search minimises within targets and limits: the mean of the objective and the spread
+    of the errors, while the mean errors of the draws are brought to zero."""
 
-    def __init__(self, variables: Variables, worst: bool, change: float) -> None:
-        self.worst, self._change = worst, change
+    def __init__(self, variables: Variables, change: float) -> None:
+        self._change = change
         self._origin, self._D = variables.start, variables.D
         self.scale = 1.0  # of the objective
 
@@ -83,37 +81,27 @@ class Criterion:
         way = self._D @ (z - self._origin)
         return 0.5 * self._change * float(way @ way), self._change * self._D.T @ way
 
-    def costs(self, evaluation: Evaluation) -> Array:
-        """Objective and half the squared errors (draws,)."""
-        return self.scale * evaluation.value + 0.5 * np.square(evaluation.errors).sum(1)
-
-    def cost_slopes(self, evaluation: Evaluation) -> Array:
-        """Gradients (draws, n) of `costs`."""
-        dv, de, _ = evaluation.slopes
-        return self.scale * dv + np.einsum("dk,dkn->dn", evaluation.errors, de)
-
     def value(self, evaluation: Evaluation) -> float:
         """The function to minimise."""
-        if self.worst:
-            combined = self.costs(evaluation).max()
-        else:
-            spread = evaluation.errors - evaluation.errors.mean(0)
-            combined = (self.scale * evaluation.value + 0.5 * np.square(spread).sum(1)).mean()
-        return float(combined) + self.changed(evaluation.z)[0]
-
-    def mean_slope(self, evaluation: Evaluation) -> Array:
-        """Gradient (n,) of the value, of the mean of the draws."""
-        dv, de, _ = evaluation.slopes
         spread = evaluation.errors - evaluation.errors.mean(0)
-        slope = self.scale * dv.mean(0) + np.einsum("dk,dkn->n", spread, de) / len(dv)
+        combined = self.scale * evaluation.value + 0.5 * np.square(spread).sum(1)
+        return float(combined.mean()) + self.changed(evaluation.z)[0]
+
+    def slope(self, evaluation: Evaluation, errors: Array) -> Array:
+        """Gradient (n,) of the value, with half the squares of these `errors` (draws, k)."""
+        dv, de, _ = evaluation.slopes
+        slope = self.scale * dv.mean(0) + np.einsum("dk,dkn->n", errors, de) / len(dv)
         return slope + self.changed(evaluation.z)[1]
+
+    def spread_slope(self, evaluation: Evaluation) -> Array:
+        """Gradient (n,) of the value."""
+        return self.slope(evaluation, evaluation.errors - evaluation.errors.mean(0))
 
     def priced_slope(self, evaluation: Evaluation) -> Array:
         """Gradient (n,) of the value with penalties on squared errors and excess."""
         over = 2 * PRICE * np.maximum(evaluation.excess, 0.0)
-        each = self.cost_slopes(evaluation) + np.einsum("dm,dmn->dn", over, evaluation.slopes[2])
-        slope = each[int(np.argmax(self.costs(evaluation)))] if self.worst else each.mean(0)
-        return slope + self.changed(evaluation.z)[1]
+        price = np.einsum("dm,dmn->n", over, evaluation.slopes[2]) / len(over)
+        return self.slope(evaluation, evaluation.errors) + price
 
 
 def missed(evaluation: Evaluation) -> float:

@@ -67,8 +67,7 @@ class Stage:
     that, so that steps along it are shorter. `aim` are the mean errors that it is to end with, None
     for the targets themselves, and `reached` is the plan that has them.
 
-    SLSQP sees x = (ways, s): in the ways between knots the price of change is round, and s, for the
-    worst draw alone, bounds what that draw costs.
+    SLSQP sees the ways x between knots, in which the price of change is round.
     """
 
     def __init__(self, search: Search, z: Array, share: float) -> None:
@@ -80,35 +79,24 @@ class Stage:
         self.aim = (1 - share) * errors if share < 1 and len(errors) else None
         self._way = share * float(np.abs(errors).max(initial=0.0))
         self.reached: Evaluation | None = None
-        ways = self.variables.D @ z
-        worst = self.criterion.worst
-        self._x = np.append(ways, self.criterion.costs(start).max()) if worst else ways
+        self._x = self.variables.D @ z
         search.improved = len(search.history)
 
     def run(self, iterations: int) -> bool:
         """Whether SLSQP converges. Raises `Settled`, `Failed` and `GradientFailed`."""
-        free = [(None, None)] if self.criterion.worst else []
-        low, high = self.variables.low, self.variables.high
-        bounds = [tuple(x if np.isfinite(x) else None for x in ends) for ends in zip(low, high)]
         found = minimize(
             self._objective, self._x, jac=self._gradient, method="SLSQP",
-            bounds=[*bounds, *free], constraints=self._constraints(),
-            options={"maxiter": iterations, "ftol": ACCURACY},
+            bounds=list(zip(self.variables.low, self.variables.high)),
+            constraints=self._constraints(), options={"maxiter": iterations, "ftol": ACCURACY},
         )  # fmt: skip
         return found.status == 0
 
     def _step(self, x: Array) -> Evaluation:
         """The plan at x. Raises `Failed`."""
-        evaluation = self.search.evaluate(self._inverse @ x[: self.variables.n])
+        evaluation = self.search.evaluate(self._inverse @ x)
         if evaluation.failure:
             raise Failed
         return evaluation
-
-    def _by_x(self, slopes: Array, s: float = 0.0) -> Array:
-        """Derivatives (..., n) by z, converted to derivatives by x."""
-        by_ways = slopes @ self._inverse
-        pad = [(0, 0)] * (slopes.ndim - 1) + [(0, int(self.criterion.worst))]
-        return np.pad(by_ways, pad, constant_values=s)
 
     def _objective(self, x: Array) -> float:
         evaluation, search = self._step(x), self.search
@@ -120,20 +108,15 @@ class Stage:
             if evaluation.excess.max(initial=0.0) <= DONE and left <= DONE * self._way:
                 self.reached = evaluation
                 raise Settled
-        if self.criterion.worst:
-            return self.share * (float(x[-1]) + self.criterion.changed(evaluation.z)[0])
         return self.share * self.criterion.value(evaluation)
 
     def _gradient(self, x: Array) -> Array:
-        evaluation = self._step(x)
-        if self.criterion.worst:
-            return self.share * self._by_x(self.criterion.changed(evaluation.z)[1], 1.0)
-        return self.share * self._by_x(self.criterion.mean_slope(evaluation))
+        return self.share * self.criterion.spread_slope(self._step(x)) @ self._inverse
 
     def _constraints(self) -> list[dict[str, Any]]:
         """Bounds of motions, targets and limits, in SciPy's form."""
-        variables, terms, criterion = self.variables, self.search.evaluator.terms, self.criterion
-        aim, rows = 0.0 if self.aim is None else self.aim, self._by_x(-variables.A)
+        variables, terms, by_x = self.variables, self.search.evaluator.terms, self._inverse
+        aim, rows = 0.0 if self.aim is None else self.aim, -variables.A @ by_x
         out = list[dict[str, Any]]()
 
         def add(kind: str, value: Callable[[Array], Any], slope: Callable[[Array], Any]) -> None:
@@ -141,22 +124,16 @@ class Stage:
 
         if len(variables.b):
             add("ineq", lambda x: variables.b + rows @ x, lambda _: rows)
-        if terms.targets and not criterion.worst:
+        if terms.targets:
             add(
                 "eq",
                 lambda x: self._step(x).errors.mean(0) - aim,
-                lambda x: self._by_x(self._step(x).slopes[1].mean(0)),
+                lambda x: self._step(x).slopes[1].mean(0) @ by_x,
             )
         if terms.limits:
             add(
                 "ineq",
                 lambda x: -self._step(x).excess.ravel(),
-                lambda x: self._by_x(-self._step(x).slopes[2].reshape(-1, variables.n)),
-            )
-        if criterion.worst:
-            add(
-                "ineq",
-                lambda x: x[-1] - criterion.costs(self._step(x)),
-                lambda x: self._by_x(-criterion.cost_slopes(self._step(x)), 1.0),
+                lambda x: -self._step(x).slopes[2].reshape(-1, variables.n) @ by_x,
             )
         return out

@@ -380,34 +380,24 @@ class Choice:
 def choose(
     problem: Problem, validation: Sequence[Record], recipe: Recipe, thresholds: Sequence[float],
     feedback: Mapping[str, Mapping[str, float]] | None = None, *, slack: float = 1.1,
-    each: bool = True,
 ) -> Choice:  # fmt: skip
     """The fit with the fewest terms among those whose rollouts of the validation records come
     within `slack` of the best.
 
-    Every equation has its own threshold (all combinations that differ in their terms are rolled
-    out), or all the same with `each` off, for models that are slow to roll out. The error of a
-    combination is the mean over the records of the states' worst NRMSE. Warns as `fit` does, of the
-    validation records. Raises `ValueError`, with the time, when all rollouts diverge.
+    Every equation has its own threshold: all combinations that differ in their terms are rolled
+    out. The error of a combination is the mean over the records of the states' worst NRMSE. Warns
+    as `fit` does, of the validation records. Raises `ValueError`, with the time, when all rollouts
+    diverge.
     """
     fits: dict[str, dict[tuple[str, ...], tuple[float, Equation]]] = {
         target: {} for target in problem.regressions
     }
-    levels: dict[float, dict[str, Equation]] = {}
     for threshold in thresholds:
-        levels[threshold] = {
-            target: solve(problem, target, replace(recipe, threshold=threshold)) for target in fits
-        }
-        for target, equation in levels[threshold].items():
-            fits[target].setdefault(
-                tuple(term.text for term, _ in equation.pairs), (threshold, equation)
-            )
-    if each:
-        options = [
-            dict(zip(fits, chosen)) for chosen in product(*(one.values() for one in fits.values()))
-        ]
-    else:
-        options = [{k: (threshold, x) for k, x in one.items()} for threshold, one in levels.items()]
+        for target, found in fits.items():
+            equation = solve(problem, target, replace(recipe, threshold=threshold))
+            terms = tuple(term.text for term, _ in equation.pairs)
+            found.setdefault(terms, (threshold, equation))
+    options = [dict(zip(fits, chosen)) for chosen in product(*(x.values() for x in fits.values()))]
     scale = np.max(
         [problem.scale, *(np.abs(one.columns(problem.states)).max(0) for one in validation)], axis=0
     )
@@ -421,16 +411,11 @@ def choose(
         last = diverged[0] if diverged else last
         models.append(model)
         every.append(scores)
-        tried.append(
-            {
-                "thresholds": {
-                    target: float(threshold) for target, (threshold, _) in option.items()
-                },
-                "terms": len(model.terms),
-                "nrmse": float(np.mean([one.worst for one in scores])),
-                "diverged": diverged,
-            }
-        )
+        tried.append({
+            "thresholds": {target: float(threshold) for target, (threshold, _) in option.items()},
+            "terms": len(model.terms), "nrmse": float(np.mean([one.worst for one in scores])),
+            "diverged": diverged,
+        })  # fmt: skip
     best = min(row["nrmse"] for row in tried)
     if not np.isfinite(best):
         raise ValueError(

@@ -1,7 +1,7 @@
 """From the tables of a rig file to the rig, its motions and its start."""
 
 from collections.abc import Callable, Mapping
-from functools import cache, partial
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -19,7 +19,6 @@ from torchsoft.rigs.initial import (
     holding_effort,
     initial_poses,
     reference,
-    setpoints,
     settled_pads,
     signal,
 )
@@ -102,12 +101,10 @@ def build(file: RigTables, parts: Mapping[str, Any] | None = None) -> BuiltRig:
     """The rig of a file with its start and its output times. Raises `ValueError`."""
     rig = assemble(file, parts)
     poses = initial_poses(file, rig, {name: signal(file, name) for name in file.driven})
-    made = setpoints(file, poses)
-    held = cache(partial(holding_effort, file, rig, poses, made))
-    rig.reference = reference(file, poses, held, made)
+    rig.reference = reference(file, poses, partial(holding_effort, file, rig, poses))
     y0 = settled_pads(file, rig, poses, rig.reference)
     warn_of_moments(rig, y0, file.starts)
-    followed = followed_motions(file, poses, held, rig.reference)
+    followed = followed_motions(file, poses, rig.reference)
     solver, y0 = file.solver.model_dump(exclude_none=True), moving(rig, y0, file.starts)
     built = BuiltRig(rig, y0, file.outputs.times(), file, followed, solver)
     built.last.update(key=built.key(rig), start=Initial(y0, rig.reference))

@@ -19,6 +19,7 @@ from torchsoft.rigs.initial import (
     holding_effort,
     initial_poses,
     settled_pads,
+    signal,
 )
 from torchsoft.rigs.schema import RigTables
 from torchsoft.solve.simulate import Initial, simulate
@@ -76,7 +77,8 @@ class BuiltRig:
         for name, one in self.followed.items():
             if name.replace(".", ":") in own.signals and own[name] is one.signal:
                 held = partial(holding_effort, self.file, rig, poses, reference)
-                values = following(one.signal.values, one.values, one.at_start(poses, held))
+                now = signal(self.file, name, poses, held).values
+                values = following(one.signal.values, one.values, now)
                 reference = reference.replaced({name: one.signal.with_values(values)})
         y0 = moving(rig, settled_pads(self.file, rig, poses, reference), self.starts)
         if key:

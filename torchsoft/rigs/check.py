@@ -16,7 +16,7 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.findings import Run, overlapping, tied
-from torchsoft.rigs.geometry import Scene, at, nodes
+from torchsoft.rigs.geometry import Scene, at
 from torchsoft.rigs.motion import ProfileTable
 from torchsoft.rigs.recorded import recordings
 from torchsoft.rigs.schema import RigTables
@@ -35,10 +35,6 @@ ROWS = 501
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
 """Largest initial distance between a set-point and its coordinate without a warning."""
-
-FARTHER, TURNED = 10.0, 20 * np.pi
-"""Thresholds of doubt in units: range of a set-point over the size of the rig, and turn of a
-set-point [rad]."""
 
 CORNERS = 1440
 """Number of points of an outline at which its curvature is computed."""
@@ -95,25 +91,6 @@ def ties(ready: BuiltRig) -> Iterator[Diagnostic]:
                 f"tie `{at(pushed)[0]}` to `{'`, `'.join(bodies)}`: whatever it does, it moves "
                 f"nothing that it sees; add a contact, or measure {pushed}",
             )  # fmt: skip
-
-
-def travels(ready: BuiltRig) -> Iterator[Diagnostic]:
-    """Warnings on motions that go much farther than the rig is large, or turn round and round."""
-    poses, rig = start(ready).pose, ready.rig
-    places = np.concatenate([nodes(pad, poses) for pad in rig.pads.values()])
-    size = float(np.ptp(places, axis=0).max())
-    limits = {
-        "m": (FARTHER * size, f"the pads together are {size:.2g} m large", "millimetres"),
-        "rad": (TURNED, f"that is more than {TURNED / (2 * np.pi):g} turns", "degrees"),
-    }
-    values = rig.follow(torch.linspace(0.0, float(ready.t[-1]), ROWS, dtype=torch.float64))
-    for name, value in zip(rig.signals, values.detach()[..., 0].unbind(-1)):
-        motion = name.replace(":", ".")
-        unit = ready.file.unit(motion)
-        most, beside, other = limits.get(unit, (np.inf, "", ""))
-        if (far := float(value.max() - value.min())) > most:
-            message = f"it goes {far:.3g} {unit}, and {beside}: is it in {other}?"
-            yield Diagnostic("warning", f"motion.{motion}", message)
 
 
 def jumps(ready: BuiltRig) -> Iterator[Diagnostic]:
@@ -180,7 +157,7 @@ def corners(ready: BuiltRig) -> Iterator[Diagnostic]:
 
 
 RULES: tuple[Callable[[BuiltRig], Iterator[Diagnostic]], ...] = (
-    ties, recordings, travels, jumps, carried, overlaps, corners,
+    ties, recordings, jumps, carried, overlaps, corners,
 )  # fmt: skip
 """All rules that need no run, in order; a new one is added here."""
 

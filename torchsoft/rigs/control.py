@@ -4,11 +4,9 @@ coordinates.
 Networks come from files of weights, which are data and never programs.
 """
 
-import io
 import re
 import zipfile
 from collections.abc import Sequence
-from math import prod
 from pathlib import Path
 from typing import Annotated, NamedTuple, Self
 
@@ -42,8 +40,10 @@ from torchsoft.tables import LISTED, line
 WEIGHTS = 2000
 """Most numbers of a network, since each becomes machine code."""
 
+TOO_MANY = f"it has more than {WEIGHTS} numbers, which are too many to be compiled"
+
 LARGEST = 10e6
-"""Largest size [B] of a file of weights."""
+"""Largest size [B] of a file of weights, packed or not."""
 
 PYTHON = (
     "a module of another kind is given in Python: torchsoft.Actuator(measures, pushes, module, "
@@ -102,37 +102,16 @@ def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequ
         )
     check_file(path, LARGEST)
     try:
-        if declared(path) > WEIGHTS:
-            raise ValueError(
-                f"it has more than {WEIGHTS} numbers, which are too many to be compiled"
-            )
         with np.load(path, allow_pickle=False) as file:
+            if sum(one.file_size for one in file.zip.infolist()) > LARGEST:  # unpacked
+                raise ValueError(TOO_MANY)
             arrays = {name: np.asarray(file[name]) for name in file.files}
-    except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (ValueError, EOFError, KeyError, MemoryError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not an .npz file of numbers: {line(error, 120)}") from None
     try:
         return layers(arrays, inputs, efforts)
     except ValueError as error:
         raise ValueError(f"{path}: {error}. {PYTHON}") from None
-
-
-def declared(path: Path) -> int:
-    """Number of values that the headings of an .npz file declare, without reading the values.
-    Raises `ValueError` for another kind of file."""
-    total = 0
-    with zipfile.ZipFile(path) as archive:
-        for info in archive.infolist():
-            if info.file_size > LARGEST:  # unpacked
-                return WEIGHTS + 1
-            member = io.BytesIO(archive.read(info))
-            version = np.lib.format.read_magic(member)
-            read = (
-                np.lib.format.read_array_header_1_0
-                if version == (1, 0)
-                else np.lib.format.read_array_header_2_0
-            )
-            total += prod(read(member)[0])
-    return total
 
 
 def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -> nn.Sequential:
@@ -148,7 +127,7 @@ def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -
             "has 0.weight, 0.bias, 2.weight, 2.bias and so on: linear layers with tanh between them"
         )
     if sum(array.size for array in arrays.values()) > WEIGHTS:
-        raise ValueError(f"it has more than {WEIGHTS} numbers, which are too many to be compiled")
+        raise ValueError(TOO_MANY)
     for name, array in arrays.items():
         if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite numbers")

@@ -40,38 +40,42 @@ class Excitation(NamedTuple):
     grip: float = GRIP
 
 
-def _sines(amplitude: float, band: tuple[float, float], seed: int) -> dict[str, Any]:
+def sines(amplitude: float, band: tuple[float, float], seed: int) -> dict[str, Any]:
+    """A multi-sine of some amplitude [m] in a band [Hz]."""
     return {"kind": "multi_sine", "amplitude": amplitude, "band": band, "seed": seed}
 
 
-def _strokes(travel: float, stroke_time: float) -> dict[str, Any]:
+def strokes(travel: float, stroke_time: float) -> dict[str, Any]:
+    """Strokes of a travel [m], each way in a time [s]."""
     return {"kind": "strokes", "travel": travel, "stroke_time": stroke_time}
 
 
-def _roll(travel: float, end: float) -> dict[str, Any]:
+def roll_to(travel: float, end: float) -> dict[str, Any]:
+    """One way [m] until a time [s]."""
     return {
         "kind": "profile", "times": (SINCE, end), "values": (0.0, travel), "offset": "start",
     }  # fmt: skip
 
 
-def _chirp(amplitude: float, first: float, last: float) -> dict[str, Any]:
+def chirp(amplitude: float, first: float, last: float) -> dict[str, Any]:
+    """A sine of some amplitude [m] from one frequency to another [Hz]."""
     return {"kind": "chirp", "amplitude": amplitude, "first": first, "last": last}
 
 
 CATALOGUE: Mapping[str, Excitation] = {
-    "slow roll": Excitation(_roll(16e-3, 4.0), duration=4.0),
-    "strokes": Excitation(_strokes(20e-3, 0.75)),
-    "fast strokes": Excitation(_strokes(20e-3, 0.25)),
-    "shaking": Excitation(_sines(10e-3, (2.0, 15.0), 0), _sines(2e-4, (2.0, 15.0), 1)),
-    "pressing": Excitation(_roll(10e-3, 2.0), _chirp(4e-4, 8.0, 8.0)),
-    "deep pressing": Excitation(_roll(30e-3, 2.0), _chirp(8e-4, 25.0, 25.0), depth=2.4e-3),
-    "deep chirp": Excitation(_chirp(5e-3, 1.0, 25.0), _chirp(5e-4, 1.0, 25.0), depth=2.4e-3),
+    "slow roll": Excitation(roll_to(16e-3, 4.0), duration=4.0),
+    "strokes": Excitation(strokes(20e-3, 0.75)),
+    "fast strokes": Excitation(strokes(20e-3, 0.25)),
+    "shaking": Excitation(sines(10e-3, (2.0, 15.0), 0), sines(2e-4, (2.0, 15.0), 1)),
+    "pressing": Excitation(roll_to(10e-3, 2.0), chirp(4e-4, 8.0, 8.0)),
+    "deep pressing": Excitation(roll_to(30e-3, 2.0), chirp(8e-4, 25.0, 25.0), depth=2.4e-3),
+    "deep chirp": Excitation(chirp(5e-3, 1.0, 25.0), chirp(5e-4, 1.0, 25.0), depth=2.4e-3),
     "light shaking": Excitation(
-        _sines(6e-3, (4.0, 20.0), 0), _sines(2e-4, (4.0, 20.0), 1), depth=2e-4
+        sines(6e-3, (4.0, 20.0), 0), sines(2e-4, (4.0, 20.0), 1), depth=2e-4
     ),
-    "light jerks": Excitation(_strokes(80e-3, 0.25), duration=1.4, depth=1e-4),
-    "hard light jerks": Excitation(_strokes(80e-3, 0.15), duration=1.3, depth=1e-4),
-    "deep jerks": Excitation(_strokes(40e-3, 0.1), duration=1.3),
+    "light jerks": Excitation(strokes(80e-3, 0.25), duration=1.4, depth=1e-4),
+    "hard light jerks": Excitation(strokes(80e-3, 0.15), duration=1.3, depth=1e-4),
+    "deep jerks": Excitation(strokes(40e-3, 0.1), duration=1.3),
 }
 """Excitations by name, from gentle to hard; `docs/motions.md` ranks them."""
 

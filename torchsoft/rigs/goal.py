@@ -14,8 +14,8 @@ from torch import Tensor
 from torchsoft.physics.rig import Rig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
-from torchsoft.plan.planning import RTOL, Method, Robust
-from torchsoft.plan.problem import Free, Terms
+from torchsoft.plan.planning import RTOL, Method
+from torchsoft.plan.problem import Terms
 from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
@@ -36,7 +36,6 @@ class Goal(Table):
     limits: dict[Name, Limit] = Field(default_factory=dict)
     uncertain: dict[Name, Range] = Field(default_factory=dict)
     draws: int = Field(default=8, ge=1, le=10_000)
-    robust: Robust = "mean"
     method: Method = "slsqp"
     iterations: int = Field(default=50, ge=1, le=100_000)
     starts: int = Field(default=1, ge=1, le=4096)
@@ -48,14 +47,6 @@ class Goal(Table):
     def from_toml(cls, path: str | Path) -> Self:
         """Read from a TOML file. Raises `InvalidTable` in one sentence."""
         return from_toml(path, cls.model_validate)
-
-    @property
-    def variables(self) -> Free:
-        """Free variables in the form that `plan` takes."""
-        return {
-            name: one if isinstance(one, Bounds) else (one.low, one.high)
-            for name, one in self.free.items()
-        }
 
 
 Draws = Mapping[str, Sequence[float] | NDArray[np.float64]]
@@ -104,8 +95,8 @@ def plan_file(
     over = drawn(file, goal, goal.draws, goal.seed, known) if goal.uncertain or known else {}
     built = file.build()
     found = plan(
-        built.rig, built.t, goal.variables, targets=goal.targets, limits=goal.limits,
-        y0=built.initial, over=over, robust=goal.robust, method=goal.method,
+        built.rig, built.t, goal.free, targets=goal.targets, limits=goal.limits,
+        y0=built.initial, over=over, method=goal.method,
         iterations=goal.iterations, starts=goal.starts, seconds=goal.seconds, rtol=goal.rtol,
         seed=goal.seed, progress=progress,
     )  # fmt: skip

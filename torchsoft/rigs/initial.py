@@ -2,8 +2,7 @@
 parameters, differentiable in them."""
 
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
-from types import MappingProxyType
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -85,14 +84,21 @@ def signal(
         raise ValueError(f"{prefix}{error}") from None
 
 
+def ordered(file: RigTables) -> list[str]:
+    """Names of motions, those that coordinates follow before those that are fed forward."""
+    return sorted(file.motion, key=lambda name: bool(sole_user(file, name, "feed_forward")))
+
+
 def reference(
-    file: RigTables, poses: Mapping[str, Tensor], held: Held,
-    made: Mapping[str, Piecewise] = MappingProxyType({}),
-) -> Reference:  # fmt: skip
-    """All motions, those that are `made` already among them, for bodies that start at `poses`.
-    Raises `ValueError` naming the field."""
-    names = file.motion
-    return Reference(**{k: made[k] if k in made else signal(file, k, poses, held) for k in names})
+    file: RigTables, poses: Mapping[str, Tensor], held: Callable[[Signals, str, float], Tensor]
+) -> Reference:
+    """All motions, for bodies that start at `poses`; `held` is the effort that holds a coordinate
+    at a time where signals are. Raises `ValueError` naming the field."""
+    made = dict[str, Piecewise]()
+    known = cache(partial(held, made))
+    for name in ordered(file):
+        made[name] = signal(file, name, poses, known)
+    return Reference(**{name: made[name] for name in file.motion})
 
 
 def sole_user(file: RigTables, motion: str, role: str) -> str:
@@ -105,13 +111,6 @@ def placed_at(poses: Mapping[str, Tensor], coordinate: str) -> Tensor:
     """Value () [m or rad] of a coordinate such as "disc.x"."""
     body, axis = at(coordinate)
     return poses[body][axis]
-
-
-def setpoints(file: RigTables, poses: Mapping[str, Tensor]) -> dict[str, Piecewise]:
-    """The motions that coordinates follow, for bodies that start at `poses`. Raises as `signal`."""
-    fed = {"feed_forward"}
-    names = [k for k, users in file.followers().items() if {role for role, _ in users} != fed]
-    return {name: signal(file, name, poses) for name in names}
 
 
 class FollowedStart(NamedTuple):
@@ -128,57 +127,32 @@ class FollowedStart(NamedTuple):
         return moved * torch.tensor(self.weights, dtype=torch.float64)
 
 
-class HeldEffort(NamedTuple):
-    """The time [s] at which values of a feed-forward hold their coordinate, the effort [N or N.m]
-    that did so when they were made, and their derivatives (k,) or (1,) with respect to it."""
-
-    coordinate: str
-    time: float
-    effort: float
-    weights: tuple[float, ...]
-
-    def shift(self, held: Held) -> Tensor:
-        """Change (k,) or (1,) of the values for efforts that hold coordinates."""
-        more = held(self.coordinate, self.time) - self.effort
-        return more * torch.tensor(self.weights, dtype=torch.float64)
-
-
 class Followed(NamedTuple):
-    """A motion with values given as "start" or "held": the signal and its values (k,) as built, the
-    start that they follow, and the efforts that they hold."""
+    """A motion with values given as "start" or "held": the signal and its values (k,) as built, and
+    the start that they follow."""
 
     signal: Piecewise
     values: Tensor
     start: FollowedStart | None
-    held: tuple[HeldEffort, ...]
-
-    def at_start(self, poses: Mapping[str, Tensor], held: Held) -> Tensor:
-        """Values (k,) for bodies that start at `poses`."""
-        start = [self.start.shift(poses)] if self.start else []
-        return sum((*start, *(one.shift(held) for one in self.held)), self.values)
 
 
 def followed_motions(
-    file: RigTables, poses: Mapping[str, Tensor], held: Held, built: Reference
+    file: RigTables, poses: Mapping[str, Tensor], built: Reference
 ) -> dict[str, Followed]:
     """Motions with values given as "start" or "held", by name, those that coordinates follow before
     those that are fed forward; as built for bodies that start at `poses`."""
     out = {}
-    for name, motion in file.motion.items():
+    for name in ordered(file):
+        motion = file.motion[name]
         if not motion.follows_start:
             continue
-        follower, fed = sole_user(file, name, "setpoint"), sole_user(file, name, "feed_forward")
         start = None
         if any(weights := motion.start_weights):
-            place = float(placed_at(poses, follower))
-            start = FollowedStart(follower, place, tuple(weights))
-        efforts = tuple(
-            HeldEffort(fed, time, float(held(fed, time)), tuple(weights))
-            for time, weights in motion.held_weights.items()
-        )
+            follower = sole_user(file, name, "setpoint")
+            start = FollowedStart(follower, float(placed_at(poses, follower)), tuple(weights))
         one: Any = built[name]
-        out[name] = Followed(one, one.values.detach().clone(), start, efforts)
-    return dict(sorted(out.items(), key=lambda item: bool(item[1].held)))
+        out[name] = Followed(one, one.values.detach().clone(), start)
+    return out
 
 
 def holding_effort(

@@ -105,18 +105,6 @@ class Motion(Group):
         offset, *values = self.words
         return [float(offset == START) + float(x == START) for x in values]
 
-    @property
-    def held_weights(self) -> dict[float, list[float]]:
-        """Derivatives (k,), or (1,) for all alike, of the values with respect to the efforts that
-        hold the coordinate, by their times [s]."""
-        offset, *values = self.words
-        times = getattr(self, "times", (0.0,))
-        out = {0.0: [1.0] * len(values)} if offset == HELD else {}
-        for i, time in enumerate(times):
-            if values[i] == HELD:
-                out.setdefault(time, [0.0] * len(values))[i] += 1.0
-        return out
-
 
 class HoldTable(Motion):
     """Stays where it is."""

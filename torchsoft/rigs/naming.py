@@ -105,6 +105,13 @@ def short_names(file: RigTables, rig: Rig, parameters: Collection[str]) -> dict[
     return out
 
 
+HIDDEN = {
+    "bodies": ("fixed", "contour"), "actuators": ("law",),
+    "controllers": ("law", "module", "feedback"),
+}  # fmt: skip
+"""Modules of parts whose parameters belong to the part itself in the file."""
+
+
 def own_name(file: RigTables, rig: Rig, group: str, part: str = "", *rest: str) -> str:
     """Name in the file of a parameter of its rig, such as "materials.silicone.E"."""
     made = {a: name for name, one in file.controllers.items() for a in one.actuators(name)}
@@ -118,11 +125,8 @@ def own_name(file: RigTables, rig: Rig, group: str, part: str = "", *rest: str) 
         group, part, rest = "laws", file.contacts[part].law, rest[1:]
     elif part in made:
         group, part = "controllers", made[part]
-        rest = tuple(one for one in rest if one not in ("law", "module", "feedback"))
-    elif group == "actuators":
-        rest = tuple(one for one in rest if one != "law")
-    elif group == "bodies":
-        rest = tuple(one for one in rest if one not in ("fixed", "contour"))
-        rest = rest[1:] if rest[-1].startswith("centre_") else rest
-    last = ["inertia" if name == "own_inertia" else name for name in rest]
+    elif group == "bodies" and rest[-1].startswith("centre_"):
+        rest = rest[1:]
+    last = [one for one in rest if one not in HIDDEN.get(group, ())]
+    last = ["inertia" if name == "own_inertia" else name for name in last]
     return ".".join([group, part, *last] if part else [group])

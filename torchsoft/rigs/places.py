@@ -15,9 +15,6 @@ from torchsoft.tables import Table, line
 ENTRY = re.compile(r"(.+?)((?:_\d+)+)")
 """Name of an entry of a list."""
 
-FROM_ZERO = re.compile(r"\.(\d+)(?=\.|$)")
-"""Number of an entry in files of before: values.1 for values_2."""
-
 
 class Place(NamedTuple):
     """A place in a rig file: keys of its tables and lists, the value, and its field."""
@@ -45,7 +42,7 @@ def place(file: Table, name: str) -> Place:
     """The place of a name such as "materials.silicone.E" or "controllers.turn.gain_1_3", the third
     of the first row. Raises `ValueError` for an unknown name."""
     at: Any = file
-    left = FROM_ZERO.sub(lambda found: f"_{int(found[1]) + 1}", name).split(".")
+    left = name.split(".")
     keys, field = list[str | int](), FieldInfo()
     while left:
         here, within = named(keys) or "the rig file", list[int]()

@@ -70,17 +70,9 @@ def run(
 def summary(file: RigFile, done: Run, found: list[Diagnostic]) -> dict[str, Any]:
     """The run in numbers, in SI units, and its provenance."""
     run, rig = done.trajectory, done.ready.rig
-    stopped = done.stopped
-    reason = (
-        None
-        if stopped is None
-        else stopped.reason
-        if isinstance(stopped, SimulationFailed)
-        else "interrupted"
-    )
     return {
         "title": file.title,
-        "stopped": reason,
+        "stopped": done.stopped and getattr(done.stopped, "reason", "interrupted"),
         "simulated_s": float(run.t[-1]),
         "bodies": {name: coordinates(rig, run, name) for name in rig.bodies},
         "contacts": {
@@ -172,15 +164,14 @@ def cost(file: RigFile, runs: bool) -> Cost:
     return Cost(steps, seconds, memory + max(mesh.memory for mesh in meshes))
 
 
-def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]:
-    """Write the figures, the player and the video of a rig file to `out`; returns the names of the
-    files."""
+def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> None:
+    """Write the figures, the player and the video of a rig file to `out`."""
     # matplotlib takes half a second, which `check` does not need
     from torchsoft.plot import figures
     from torchsoft.plot.animation import animate, player
     from torchsoft.plot.dashboard import dashboard
 
-    title, written = plain(file.title), []
+    title = plain(file.title)
     made = {
         "dashboard": lambda: dashboard(run, title=title),
         "snapshots": lambda: figures.snapshots(run, file.outputs.snapshots, title=title),
@@ -188,15 +179,10 @@ def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]
     if file.outputs.figures:
         for name, figure in tqdm(made.items(), "figures", unit="figure", disable=hidden(progress)):
             figures.save(figure(), out / f"{name}.png")
-            written.append(f"{name}.png")
     if file.outputs.figures if file.outputs.player is None else file.outputs.player:
         player(run, out / "player.html", title=title)
-        written.append("player.html")
     if file.outputs.video != "none":
-        name = f"video.{file.outputs.video}"
         animate(
-            run, out / name, frames=file.outputs.frames, progress=progress, title=title,
-            follow=file.outputs.follow,
+            run, out / f"video.{file.outputs.video}", frames=file.outputs.frames,
+            progress=progress, title=title, follow=file.outputs.follow,
         )  # fmt: skip
-        written.append(name)
-    return written

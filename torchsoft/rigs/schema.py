@@ -1,6 +1,6 @@
 """Tables of a rig file, and the rules between them."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -158,16 +158,6 @@ class RigTables(Group):
             except ValueError as error:
                 raise ValueError(f"{field}{error}") from None
         return self
-
-    @model_validator(mode="before")
-    @classmethod
-    def _has_names(cls, data: Any) -> Any:
-        if isinstance(data, Mapping) and "channels" in data:
-            raise ValueError(
-                "channels is not known: channels have one name each; say [names], the short name "
-                'first: theta = "theta_C"'
-            )
-        return data
 
     @model_validator(mode="after")
     def _names_are_there(self) -> Self:

@@ -31,7 +31,7 @@ def resolvable(sd: float, value: float = 1.0) -> float:
 
 
 class Rest(Table):
-    """A recording that begins at rest, `lead` [s] after its bodies were put where the rig file has
+    """A recording that starts at rest, `lead` [s] after its bodies were put where the rig file has
     them start; `position_sd` has by coordinate how well that is known [m or rad]."""
 
     kind: Literal["rest"] = "rest"
@@ -41,25 +41,25 @@ class Rest(Table):
     )
 
 
-class Known(Table):
+class Given(Table):
     """Prior knowledge of a coordinate: mean and standard deviation [m, rad, m/s or rad/s]."""
 
     mean: float = Field(ge=-1e6, le=1e6)
     sd: float = Field(ge=0, le=1e6)
 
     @model_validator(mode="after")
-    def _is_a_distribution(self) -> "Known":
+    def _is_a_distribution(self) -> "Given":
         resolvable(self.sd, self.mean)
         return self
 
 
 class Moving(Table):
-    """A recording that begins anywhere, in motion or in mid-grasp: its samples of the first `lead`
+    """A recording that starts anywhere, in motion or in mid-grasp: its samples of the first `lead`
     [s] tell where, with what is `given` of coordinates such as "disc.x" and "disc.v_x"."""
 
     kind: Literal["moving"] = "moving"
     lead: float = Field(default=LEAD, gt=0, le=10)
-    given: dict[Name, Known] = Field(default_factory=dict)
+    given: dict[Name, Given] = Field(default_factory=dict)
 
 
 StartTable = Annotated[Rest | Moving, Field(discriminator="kind")]
@@ -115,7 +115,7 @@ class Law(Table):
 
 class Rehearsal(Table):
     """Settings of a rehearsal: samples a second, the recordings' `duration` [s] (by default that
-    of the rig file), the `seed` of the noise, and the factor by which the search begins `away` from
+    of the rig file), the `seed` of the noise, and the factor by which the search starts `away` from
     the truth."""
 
     rate: float = Field(default=200.0, ge=1.0, le=1e5)

@@ -190,7 +190,7 @@ def design(
     `bounds` holds the travel, speed and free knots of signals of the reference, `limits`
     the ranges (low, high) [unit] of channels of the run, such as forces.
 
-    The search begins with the plan's own motion. Each of the `iterations` takes a run with
+    The search starts with the plan's own motion. Each of the `iterations` takes a run with
     sensitivities and 2 n with the adjoint, of relative tolerance `rtol`. A motion that cannot be
     run is skipped; on Ctrl-C the best so far is returned, with a finding. Raises `ValueError` for
     arguments that do not fit together, and where the plan itself cannot be run.
@@ -284,7 +284,7 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
     """Simulate the recordings of a configuration, with the parameters of its rig file, and write
     them to `out` as CSV files, which are templates of those to record.
 
-    Returns the configuration of their identification, whose search begins away from the truth, and
+    Returns the configuration of their identification, whose search starts away from the truth, and
     the files. Raises `ValueError`, and `SimulationFailed` for a motion that the rig cannot follow.
     """
     file = RigFile.from_toml(RigFile.path(stated.rig, config.parent))

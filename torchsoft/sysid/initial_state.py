@@ -2,7 +2,7 @@
 estimated.
 
 A start adds coordinates of its own to a problem, called `start.<body>.<axis>` and the like, each
-with a prior; their values travel with those of the parameters, and the state at the beginning is
+with a prior; their values travel with those of the parameters, and the initial state is
 differentiable in both.
 """
 
@@ -51,7 +51,7 @@ BOUNDS = 8.0
 
 
 class StartCoordinate(NamedTuple):
-    """One coordinate of a start: its name, its prior's mean, where the search begins, and its
+    """One coordinate of a start: its name, its prior's mean, where the search starts, and its
     standard deviation [SI]."""
 
     name: str
@@ -60,7 +60,7 @@ class StartCoordinate(NamedTuple):
 
 
 InitialState = Callable[[Mapping[str, Tensor]], Tensor]
-"""The state (size,) at the beginning for values of the start's coordinates by name, differentiable
+"""The initial state (size,) for values of the start's coordinates by name, differentiable
 in these and in the parameters of the rig that it was made for."""
 
 
@@ -73,7 +73,7 @@ class Start(Protocol):
         ...
 
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
-        """Unknown coordinates. Raises `ValueError` for a rig that cannot begin so."""
+        """Unknown coordinates. Raises `ValueError` for a rig that cannot start so."""
         ...
 
     def initial_state(self, rig: Rig, samples: Samples) -> InitialState:
@@ -130,7 +130,7 @@ class Standing(NamedTuple):
         position_sd: Mapping[str, float] | None = None,
     ) -> "Standing":
         """Bodies at the places of the state y0 (size,). Warns of pads that do not forget their
-        beginning within the lead."""
+        initial state within the lead."""
         if lead > 0:
             warn_of_memory(rig, lead)
         state = rig.unpack(y0.detach())
@@ -221,8 +221,8 @@ def reference_from(rig: Rig, start: Start, pose: Mapping[str, Tensor]) -> Refere
 
 
 def warn_of_memory(rig: Rig, lead: float) -> None:
-    """Warns of massless pads that do not forget their beginning before the first sample, `lead` [s]
-    later."""
+    """Warns of massless pads that do not forget their initial state before the first sample,
+    `lead` [s] later."""
     for name, pad in rig.pads.items():
         longest = float(pad.chain()[1].detach().max())
         if not pad.inertial and lead < FORGOTTEN * longest:
@@ -269,7 +269,7 @@ def along(pad: Pad, positions: Tensor) -> Array:
 
 
 class MovingStart(NamedTuple):
-    """A run begins in motion, `lead` [s] before the first sample.
+    """A run starts in motion, `lead` [s] before the first sample.
 
     `bodies` holds mean and standard deviation of every free coordinate by its name, "disc.x" [m, or
     rad], and of every rate, "disc.v_x" [m/s, or rad/s]. What has a deviation above zero is a

@@ -51,7 +51,7 @@ from torchsoft.tables import line, shown
 #
 # Columns are the rig's own channels and signals, by the names that a run of the file writes. A
 # signal without a column is the file's own motion, counted from the same zero of time. What a
-# recording at rest begins with is held against where the file has bodies and motions start.
+# recording at rest starts with is compared with where the file has bodies and motions start.
 
 
 FARTHEST = 10.0
@@ -75,7 +75,7 @@ of the file: a body put down on a pad still settles."""
 WAY_OUT = 'or say start = {kind = "moving"} for a recording that begins in motion or in mid-grasp'
 
 SLACK = 0.05
-"""Time [s] by which a recording may begin after the file's own motions, or end after them."""
+"""Time [s] by which a recording may start after the file's own motions, or end after them."""
 
 
 def vocabulary(rig: Rig, stated: Mapping[str, Column]) -> Vocabulary:
@@ -191,7 +191,7 @@ def check_plausible(rig: Rig, state: State, tables: Tables) -> None:
 
 def check_clock(file: RigFile, rig: Rig, tables: Tables, start: StartTable) -> None:
     """Raises `ValueError` naming row and column for times outside the file's own motions, where a
-    signal has no column, and for a recording at rest that begins after their start."""
+    signal has no column, and for a recording at rest that starts after theirs."""
     own = [signal for signal in rig.signals if signal not in tables]
     end = file.outputs.duration
     for table in tables.tables if own else ():
@@ -217,7 +217,7 @@ class FirstRows(NamedTuple):
     name: str
     unit: str
     table: Columns
-    rows: Array
+    rows: Sequence[int]
     t: Array
     y: Array
     noise: float
@@ -230,7 +230,7 @@ class FirstRows(NamedTuple):
 def check_start(
     made: Recording, y0: Tensor, own: Reference, tables: Tables, sensors: Mapping[str, Sensor]
 ) -> None:
-    """Raises `ValueError` naming row and column for a recording that does not begin at rest, with
+    """Raises `ValueError` naming row and column for a recording that does not start at rest, with
     coordinates and set-points where the rig file says; `own` are the file's motions."""
     first, columns = tables.first_time, list[FirstRows]()
     for name, (t, y) in tables.columns.items():
@@ -240,7 +240,9 @@ def check_start(
             sensor = sensors.get(name)
             noise, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
             table = tables.of(name)
-            columns.append(FirstRows(name, unit, table, rows, t[rows], y[rows], noise, bias))
+            columns.append(
+                FirstRows(name, unit, table, rows.tolist(), t[rows], y[rows], noise, bias)
+            )
     check_places(made, y0, own, first, columns)
     check_rest(made, y0, own, first, columns)
 
@@ -248,7 +250,7 @@ def check_start(
 def check_places(
     made: Recording, y0: Tensor, own: Reference, first: float, columns: Sequence[FirstRows]
 ) -> None:
-    """Raises `ValueError` for a column that begins elsewhere than the rig file."""
+    """Raises `ValueError` for a column that starts elsewhere than the rig file."""
     places, unsure = start_places(made, y0, own, first)
     for one in columns:
         known, y, unit = places.get(one.name, [one.y[0]]), one.y[0], one.unit
@@ -292,7 +294,7 @@ def start_places(
     with torch.no_grad():
         signals = rig.follow(first)
         here = read(Seen(rig, rig.unpack(y0, signals), signals))
-        # a recording at rest begins with the file's motions, whatever its clock counts from
+        # a recording at rest starts with the file's motions, whatever its clock counts from
         stated = own(torch.zeros((), dtype=torch.float64), rig.signals)[:, 0]
     places = {name: [float(value)] for name, value in here.items() if name in made.samples}
     places |= {name: [float(value)] for name, value in zip(rig.signals, stated)}

@@ -101,7 +101,7 @@ DIFFERENCE = 1e-2
 touch, leave and slip."""
 
 MARGIN = 0.97
-"""Fraction of a limit from which the penalty begins, since peaks lie between samples."""
+"""Fraction of a limit from which the penalty starts, since peaks lie between samples."""
 
 PREDICTABLE = 10.0
 """Largest derivative of a sample by the logarithm of a parameter, over the largest sample of its

@@ -395,8 +395,8 @@ def controller_findings(
         force, *others = every = [channel(rig, one) for one in (name, *actuator.measures)]
         lacking = [one for one in every if not comparable(recording, sensors, one)]
         if lacking and force not in lacking and not actuator.is_loop:
-            facts = {"force": force, "lacking": lacking[0]}
-            one = found("not-compared", f"controller of {force}", recording, **facts)
+            name = f"controller of {force}"
+            one = found("not-compared", name, recording, force=force, lacking=lacking[0])
             yield replace(one, severity="note")
         faults = [(s.bias, s.delay, s.gain, s.drift) for s in map(sensors.get, every) if s]
         if lacking or np.any(faults) or any(id(p) in tensors for p in actuator.parameters()):
@@ -405,7 +405,8 @@ def controller_findings(
         if abs(off) > usual:
             feed = actuator.feed_forward
             ask = {"feed": feed} if feed else {"loop": f"the actuator {name}"}
-            facts = {"force": force, "off": off, "unit": actuator.effort_unit} | ask
+            facts: dict[str, Any] = {"force": force, "off": off, "unit": actuator.effort_unit}
+            facts |= ask
             yield found("controller", feed or f"loop of {force}", recording, **facts)
 
 

@@ -118,7 +118,7 @@ class Recording:
 
     @property
     def run_start(self) -> float:
-        """InitialState of the run [s]."""
+        """Initial time of the run [s]."""
         return float(self.times[0] - self.start.lead)
 
     @property
@@ -148,13 +148,11 @@ class Recording:
         """Values that can be identified, by name: the rig's scalar parameters, under their aliases
         where they have one, and the start's coordinates."""
         names = {own: name for name, own in self.rig.names.items()}
-        mine = [
-            (own, value)
+        numbers = {
+            names.get(own, own): float(value.detach())
             for own, value in self.rig.named_parameters()
-            if not own.startswith("reference.")
-        ]
-        scalars = {names.get(own, own): value for own, value in mine if value.ndim == 0}
-        numbers = {name: float(value.detach()) for name, value in scalars.items()}
+            if value.ndim == 0 and not own.startswith("reference.")
+        }
         return numbers | {c.name: c.mean for c in self.start_coordinates}
 
     def run_context(self) -> RunContext:
@@ -171,9 +169,9 @@ class Recording:
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
     def grid(self, interpolated: bool) -> Grid:
-        """Times to simulate: the begin, where it is before the samples, then the samples' own
-        times, or a regular grid from `REACH` before the first, but not before the begin, to `REACH`
-        after the last."""
+        """Times to simulate: the initial time, where it is before the samples, then the samples'
+        own times, or a regular grid from `REACH` before the first, but not before the initial time,
+        to `REACH` after the last."""
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
@@ -184,17 +182,19 @@ class Recording:
     @cached_property
     def start_fingerprint(self) -> str:
         """Checksum of everything that determines the initial state, besides the unknowns."""
-        signals = self.rig.follow(self.run_start).detach().numpy().tobytes()
-        return sha256(identity(self.rig) + signals + repr(self.start).encode()).hexdigest()
+        return self._checksum(self.run_start)
 
     @cached_property
     def fingerprint(self) -> str:
         """Checksum of everything that determines a run or a residual of this recording."""
-        t = torch.from_numpy(np.linspace(self.run_start, self.times[-1], 2000))
-        signals = self.rig.follow(t).detach().numpy().tobytes()
-        measured = b"".join(
-            k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items())
-        )
+        measured = sorted(self.samples.items())
+        rows = (k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in measured)
+        return self._checksum(np.linspace(self.run_start, self.times[-1], 2000), b"".join(rows))
+
+    def _checksum(self, t: float | Array, measured: bytes = b"") -> str:
+        """Checksum of the rig, of its signals at times t [s], of what was `measured` and of the
+        start."""
+        signals = self.rig.follow(torch.as_tensor(t)).detach().numpy().tobytes()
         return sha256(
             identity(self.rig) + signals + measured + repr(self.start).encode()
         ).hexdigest()
@@ -208,47 +208,36 @@ def extended(recording: Recording, names: Collection[str]) -> Recording:
     return replace(recording, rig=rig)
 
 
-def identity(rig: Rig) -> bytes:
-    """Identity of a rig without its reference: numbers and plain attributes of its parts, and the
-    source of user-defined parts."""
-    parts = [
-        (name, part) for name, part in rig.named_modules() if name.split(".")[0] != "reference"
-    ]
-    text = [f"{name} {type(part).__qualname__} {plain(part)}" for name, part in parts]
-    text += [f"{name} {taxels}" for name, taxels in rig.taxels.items()]
-    values = [getattr(v, "func", v) for _, part in parts for v in vars(part).values()]
-    functions = [value for value in values if inspect.isfunction(value)]
-    code = {
-        f"{one.__module__}.{one.__qualname__}": one
-        for one in (*(type(part) for _, part in parts), *functions)
-    }
-    own = {
-        name: one for name, one in code.items() if name.split(".")[0] not in ("torch", "torchsoft")
-    }
-    return repr(text).encode() + b"".join(name.encode() + source(own[name]) for name in sorted(own))
-
-
 ARRAYS = np.ndarray, Tensor
 VALUES = int, float, str, np.generic, tuple, list, dict, FunctionType, partial, type(None)
 """Types of attributes that identify a part."""
 
 
+def identity(rig: Rig) -> bytes:
+    """Identity of a rig without its reference: numbers and plain attributes of its parts, and the
+    source of user-defined parts."""
+    modules = rig.named_modules()
+    parts = {name: part for name, part in modules if name.split(".")[0] != "reference"}
+    text = [f"{name} {type(part).__qualname__} {plain(part)}" for name, part in parts.items()]
+    text += [f"{name} {taxels}" for name, taxels in rig.taxels.items()]
+    values = [getattr(v, "func", v) for part in parts.values() for v in vars(part).values()]
+    code = [*map(type, parts.values()), *filter(inspect.isfunction, values)]
+    own = {source(c) for c in code if c.__module__.split(".")[0] not in ("torch", "torchsoft")}
+    return repr(text).encode() + b"".join(sorted(own))
+
+
 def plain(part: nn.Module) -> str:
     """A part's own parameters and buffers, and its attributes that are numbers, text, arrays,
     functions or tuples of them, as text."""
-    tensors = {
-        **dict(part.named_parameters(recurse=False)),
-        **dict(part.named_buffers(recurse=False)),
-    }
-    known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
+    known: dict[str, Any] = dict(part.named_parameters(recurse=False))
+    known |= dict(part.named_buffers(recurse=False))
     for name, value in vars(part).items():
-        if name in ("tables", "short"):  # on which no run depends
-            continue
-        if isinstance(value, ARRAYS) or (not name.startswith("_") and isinstance(value, VALUES)):
-            known[name] = stated(value)
+        public = not name.startswith("_") and isinstance(value, VALUES)
+        if name not in ("tables", "short") and (public or isinstance(value, ARRAYS)):
+            known[name] = value  # no run depends on "tables" and "short"
     if isinstance(part, Pad):
         known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded.tolist()
-    return repr(sorted(known.items()))
+    return repr(sorted((name, stated(value)) for name, value in known.items()))
 
 
 def stated(value: Any) -> Any:

@@ -161,7 +161,7 @@ def correlations(result: IdentificationResult) -> str:
     """Strong correlations in words."""
     C, labels = np.tril(np.array(result.correlation, float), -1), result.labels
     strong = [
-        f"{labels[i]} and {labels[j]} {grouped(C[i, j], 2)}"
+        f"{labels[i]} and {labels[j]} {grouped(float(C[i, j]), 2)}"
         for i, j in np.argwhere(np.abs(C) > STRONG)
     ]
     return "; ".join(strong) or f"none is beyond {STRONG}"

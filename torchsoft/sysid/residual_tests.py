@@ -127,7 +127,7 @@ MEDIAN = 0.37
 """Efficiency of the level by the median residual, relative to the mean square."""
 
 SUDDEN, BEFORE, BEYOND = 3.0, 2.0, 5.0
-"""Least ratio of rms residuals after a time to those before it at which a misfit begins there,
+"""Least ratio of rms residuals after a time to those before it at which a misfit starts there,
 largest rms residual before it, and the residual that shows it first, which one sample in a million
 exceeds by chance; over the noise."""
 
@@ -337,8 +337,8 @@ def largest_change(part: Part) -> ResidualTest:
 
 
 def onset(mine: Sequence[Part]) -> list[ResidualTest]:
-    """Test of a misfit that begins at a certain time, of the parts of one recording; empty where
-    none does. It begins with the first residual beyond `BEYOND` in any channel that fits until
+    """Test of a misfit that starts at a certain time, of the parts of one recording; empty where
+    none does. It starts with the first residual beyond `BEYOND` in any channel that fits until
     then."""
     changes = [
         one
@@ -383,7 +383,7 @@ def correlated_channels(
     n = rows.shape[1] - sum(float(np.sum(Q[p.rows] ** 2)) for p in alike) / k
     if n < 4 * k or (rows.std(1) == 0).any():
         return []
-    C = np.corrcoef(rows)
+    C = np.atleast_2d(np.corrcoef(rows))
     square = -(n - 1 - (2 * k + 5) / 6) * float(np.linalg.slogdet(C)[1])
     i, j = np.unravel_index(int(np.argmax(np.abs(np.triu(C, 1)))), C.shape)
     facts = {"channels": f"{alike[i].channel} and {alike[j].channel}"}

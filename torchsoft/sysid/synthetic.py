@@ -48,7 +48,7 @@ def record(
     `planned`.
 
     `planned` is the result of `RigFile.build`; `truth` holds parameters that differ, by the names
-    of `Rig.parameter`, or is a rig with other laws and the same pads. The run begins at `start`, by
+    of `Rig.parameter`, or is a rig with other laws and the same pads. The run starts at `start`, by
     default with bodies that stand, or rest, as planned. Samples are taken at `rate` [Hz] from a run
     with the tolerance `rtol`, with Gaussian noise of `noise` times each sensor's own. The recording
     holds nothing of the truth but the samples. Raises `ValueError` for an unknown name or channel,

@@ -134,7 +134,7 @@ class Sensor(Table):
     plane; the `inertia` [kg] between a force sensor and the body that it pushes, whose acceleration
     it does not feel; the `clock` [1] that runs too fast, counted from the middle of the recording;
     the `lag` [s], the time constant of a low-pass of first order that rests at the first sample;
-    the `backlash` [unit], the width of the play of a gear, in the middle of which it begins.
+    the `backlash` [unit], the width of the play of a gear, in the middle of which it starts.
     Zero leaves a fault out; others are identified, one for all recordings or one for each (`per`).
     Samples at `low` or `high` [unit] or beyond are saturated: they only say that value plus noise
     is there or beyond (Tobin's likelihood), and the noise must be white. Readings in steps of a
@@ -356,8 +356,9 @@ def check_unknown(
             raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`")
     if name not in given:
         several = dict(rig.named_parameters()).get(rig.aliases.get(name, name))
-        many = several is not None and several.ndim
-        why = f"it has {several.numel()} numbers, and an unknown is one" if many else ""
+        why = ""
+        if several is not None and several.ndim:
+            why = f"it has {several.numel()} numbers, and an unknown is one"
         raise ValueError(
             f"unknowns: `{line(name, 80)}` cannot be identified; "
             f"{why or suggestion(name, given, 'known:')}"

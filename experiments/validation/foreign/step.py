@@ -44,13 +44,22 @@ def aged(p, h, age, slip):
 
 
 @njit(cache=True, nogil=True)
-def node(p, h, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k):
+def centre_of_mass(p, theta):
+    """From the contour's centre to the centre of mass, (2,) [m]."""
+    return (
+        p.com_x * np.cos(theta) - p.com_y * np.sin(theta),
+        p.com_x * np.sin(theta) + p.com_y * np.cos(theta),
+    )
+
+
+@njit(cache=True, nogil=True)
+def node(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k):
     """One node at the end of a step, for speeds rx, ry of the node against the disc's centre and
     the spin.
 
-    d is from the centre to the node at the beginning, s the stretch there. Returns the force on the
-    node fx, fy, the torque on the disc, the new stretch, whether it slips by the literal law, and
-    the speed of slip.
+    d is from the centre to the node at the beginning, theta the disc's angle and s the stretch
+    there. Returns the force on the node fx, fy, the torque on the disc about the centre of mass,
+    the new stretch, whether it slips by the literal law, and the speed of slip.
     """
     dx, dy = dx + h * rx, dy + h * ry
     far = np.sqrt(dx * dx + dy * dy)
@@ -83,29 +92,20 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k):
         e = p.K_t * stretch + p.R_t * (stretch - s) / h
         slips = False
     F_N -= p.adhesion * g / (g + TAKEN_IN)
-    return F_N * nx - e * ny, F_N * ny + e * nx, -far * e, stretch, slips, rate
-
-
-@njit(cache=True, nogil=True)
-def about_centre_of_mass(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k):
-    """Force of a node on the pad, and its torque on the disc about the centre of mass; theta is
-    the disc's angle at the beginning."""
-    fx, fy, torque = node(p, h, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k)[:3]
-    if p.com_x != 0.0 or p.com_y != 0.0:
-        cx, cy = centre_of_mass(p, theta + h * omega)
-        torque += cx * fy - cy * fx
-    return fx, fy, torque
+    fx, fy = F_N * nx - e * ny, F_N * ny + e * nx
+    cx, cy = centre_of_mass(p, theta + h * omega)
+    return fx, fy, cx * fy - cy * fx - far * e, stretch, slips, rate
 
 
 @njit(cache=True, nogil=True)
 def linearise(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k, share, f, slope):
     """Force (fx, fy, torque) of a node that stands for `share` spacings of surface, and its slopes
     (3, 3) by rx, ry, omega."""
-    at = about_centre_of_mass(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k)
+    at = node(p, h, theta, rx, ry, omega, dx, dy, s, slipping, mu_s, mu_k)[:3]
     for b in range(3):
         by = DIFFERENCE if b < 2 else DIFFERENCE / p.radius
         vx, vy, spin = rx + by * (b == 0), ry + by * (b == 1), omega + by * (b == 2)
-        moved = about_centre_of_mass(p, h, theta, vx, vy, spin, dx, dy, s, slipping, mu_s, mu_k)
+        moved = node(p, h, theta, vx, vy, spin, dx, dy, s, slipping, mu_s, mu_k)[:3]
         for a in range(3):
             f[a] = share * at[a]
             slope[a, b] = share * (moved[a] - at[a]) / by
@@ -158,22 +158,24 @@ def drive(p, h, q, w, z, ahead, held, past, before):
 
 @njit(cache=True, nogil=True)
 def near_nodes(p, X, share, q, u, margin):
-    """Pads and numbers (m,) of the nodes that may touch, and how they are from the centre, and
-    their shares: (m, 2), (m,)."""
-    count, m = X.shape[1], 0
-    which, d, shares = (
-        np.empty((2 * count, 2), np.int64),
-        np.empty((2 * count, 2)),
-        np.empty(2 * count),
-    )
-    for k in range(2):
-        for i in range(count):
-            for a in range(2):
-                d[m, a] = X[k, i, a] + u[k, i, a] + k * q[3 + a] - q[a]
-            if np.sqrt(d[m, 0] ** 2 + d[m, 1] ** 2) < p.radius + margin:
-                which[m, 0], which[m, 1], shares[m] = k, i, share[i]
-                m += 1
-    return which[:m], d[:m], shares[:m]
+    """Pads and numbers (m, 2) of the nodes that may touch, where they are from the centre (m, 2),
+    and their shares (m,)."""
+    every = X + u
+    every[1] += q[3:]
+    every -= q[:2]
+    which = np.argwhere(every[..., 0] ** 2 + every[..., 1] ** 2 < (p.radius + margin) ** 2)
+    d = np.empty((len(which), 2))
+    for j in range(len(which)):
+        d[j] = every[which[j, 0], which[j, 1]]
+    return which, d, share[which[:, 1]]
+
+
+@njit(cache=True, nogil=True)
+def retarded(p, h):
+    """Parts of the pads' compliance, the main, the slow and the one at once, and what each moves by
+    in a step, over that and the step: (3,) and (3,) [1/s]."""
+    parts = np.array([1 - p.slow - p.fast, p.slow, p.fast])
+    return parts, 1 / (np.array([p.tau, p.slow_tau, AT_ONCE]) + h)
 
 
 @njit(cache=True, nogil=True)
@@ -184,46 +186,25 @@ def resistance(p, v):
 
 
 @njit(cache=True, nogil=True)
-def centre_of_mass(p, theta):
-    """From the contour's centre to the centre of mass, (2,) [m]."""
-    return (
-        p.com_x * np.cos(theta) - p.com_y * np.sin(theta),
-        p.com_x * np.sin(theta) + p.com_y * np.cos(theta),
-    )
-
-
-@njit(cache=True, nogil=True)
-def balance(p, h, C, which, d, shares, q, v, parts, s, slipping, ages, now, loops, w, z, r, J):
+def balance(p, h, C, which, d, shares, q, v, u, s, slipping, ages, now, loops, w, z, r, J):
     """What is left over of all equations, r (n,), and its derivatives J (n, n), for the velocities
     z at the end of the step.
 
     z = (disc x, y, spin, bracket x, y, then x and y of each near node against its base).
     """
-    J[:] = 0.0
-    for a in range(len(z)):
-        J[a, a] = 1.0
-    gain = np.array(
-        [
-            h / p.mass,
-            h / p.mass,
-            h / (0.5 * p.inertia * p.mass * p.radius**2),
-            h / p.bracket_mass,
-            h / p.bracket_mass,
-        ]
-    )
-    u, u_slow, u_fast = parts
+    J[:] = np.eye(len(z))
+    inertia = 0.5 * p.inertia * p.mass * p.radius**2
+    gain = h / np.array([p.mass, p.mass, inertia, p.bracket_mass, p.bracket_mass])
     soft, worn = now
     held, past, before = loops
     F_x, F_y, by_x, by_y = drive(p, h, q, w, z, h, held, past, before)
-    for a in range(5):
-        r[a] = z[a] - v[a]
-    if p.com_x != 0.0 or p.com_y != 0.0:
-        cx, cy = centre_of_mass(p, q[2])
-        ex, ey = centre_of_mass(p, q[2] + h * z[2])
-        r[0] += v[2] * cy - z[2] * ey
-        r[1] += z[2] * ex - v[2] * cx
-        J[0, 2] -= ey + h * z[2] * ex
-        J[1, 2] += ex - h * z[2] * ey
+    r[:5] = z[:5] - v
+    cx, cy = centre_of_mass(p, q[2])
+    ex, ey = centre_of_mass(p, q[2] + h * z[2])
+    r[0] += v[2] * cy - z[2] * ey
+    r[1] += z[2] * ex - v[2] * cx
+    J[0, 2] -= ey + h * z[2] * ex
+    J[1, 2] += ex - h * z[2] * ey
     r[0] -= h * p.gravity * np.sin(p.tilt)
     r[1] += h * p.gravity * np.cos(p.tilt)
     against, by_against = resistance(p, z[3])
@@ -232,14 +213,12 @@ def balance(p, h, C, which, d, shares, q, v, parts, s, slipping, ages, now, loop
     r[4] -= gain[4] * F_y
     J[3, 0 if p.senses_disc else 3] += gain[3] * by_x
     J[4, 4] += gain[4] * by_y
+    parts, rate = retarded(p, h)
+    give = (parts * rate).sum()
+    f, slope = np.empty(3), np.empty((3, 3))
     for j in range(len(which)):
         for a in range(2):
-            late, early = u_slow[which[j, 0], which[j, 1], a], u_fast[which[j, 0], which[j, 1], a]
-            rest = u[which[j, 0], which[j, 1], a] - late - early
-            r[5 + 2 * j + a] = z[5 + 2 * j + a] + rest / (p.tau + h) + late / (p.slow_tau + h)
-            r[5 + 2 * j + a] += early / (AT_ONCE + h)
-    give = (1 - p.slow - p.fast) / (p.tau + h) + p.slow / (p.slow_tau + h) + p.fast / (AT_ONCE + h)
-    f, slope = np.empty(3), np.empty((3, 3))
+            r[5 + 2 * j + a] = z[5 + 2 * j + a] + (rate * u[:, which[j, 0], which[j, 1], a]).sum()
     for j in range(len(which)):
         k, i = which[j]
         rx, ry = z[5 + 2 * j] + k * z[3] - z[0], z[6 + 2 * j] + k * z[4] - z[1]
@@ -250,8 +229,7 @@ def balance(p, h, C, which, d, shares, q, v, parts, s, slipping, ages, now, loop
         )  # fmt: skip
         for a in range(2):
             load(r, J, a, gain[a], f[a], slope[a], j, k)
-            if k == 1:
-                load(r, J, 3 + a, -gain[3 + a], f[a], slope[a], j, k)
+            load(r, J, 3 + a, -k * gain[3 + a], f[a], slope[a], j, k)
         load(r, J, 2, -gain[2], f[2], slope[2], j, k)
         for other in range(len(which)):
             if which[other, 0] == k:
@@ -266,12 +244,12 @@ def load(r, J, row, gain, force, slope, j, k):
     """Adds a force of near node j, on pad k, to an equation, with its slopes by the node's speeds
     and the spin."""
     r[row] += gain * force
-    for b in range(2):
-        J[row, 5 + 2 * j + b] += gain * slope[b]
-        J[row, b] -= gain * slope[b]
-        if k == 1:
-            J[row, 3 + b] += gain * slope[b]
     J[row, 2] += gain * slope[2]
+    for b in range(2):
+        by = gain * slope[b]
+        J[row, 5 + 2 * j + b] += by
+        J[row, b] -= by
+        J[row, 3 + b] += k * by
 
 
 @njit(cache=True, nogil=True)
@@ -284,101 +262,71 @@ def largest(p, x):
 
 
 @njit(cache=True, nogil=True)
-def step(p, h, C, X, share, q, v, parts, u_dot, s, slipping, ages, now, loops, w, margin):
-    """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...)
-    displacements (nodes, 2), the slow and the fast part of them, and their rates, stretches s, the
-    literal law's flags and how long nodes have stuck. `now` are the pads' compliance over that of
-    the begin, and what wear has left of friction; `loops` are what `drive` takes at its end.
-    Returns whether it was solved, the fastest slip, and how many nodes touch. Newton's change is
-    halved where it would leave more over than there was."""
-    which, d, shares = near_nodes(p, X, share, q, parts[0], margin)
+def step(p, h, C, X, share, q, v, u, u_dot, s, slipping, ages, now, loops, w, margin):
+    """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...) the
+    parts of displacements (3, 2, nodes, 2) and the rates of their sum, stretches s, the literal
+    law's flags and how long nodes have stuck. `now` are the pads' compliance over that of the
+    begin, and what wear has left of friction; `loops` are what `drive` takes at its end. Returns
+    whether it was solved, the fastest slip, and how many nodes touch. Newton's change is halved
+    where it would leave more over than there was."""
+    which, d, shares = near_nodes(p, X, share, q, u.sum(0), margin)
     n = 5 + 2 * len(which)
-    z, r, J, scale, change, before = (
-        np.empty(n),
-        np.empty(n),
-        np.empty((n, n)),
-        1.0,
-        np.zeros(n),
-        np.inf,
-    )
+    z, r, J = np.empty(n), np.empty(n), np.empty((n, n))
+    change, scale, before = np.zeros(n), 1.0, np.inf
     z[:5] = v
     for j in range(len(which)):
         z[5 + 2 * j : 7 + 2 * j] = u_dot[which[j, 0], which[j, 1]]
     for _ in range(MOST):
-        balance(p, h, C, which, d, shares, q, v, parts, s, slipping, ages, now, loops, w, z, r, J)
+        balance(p, h, C, which, d, shares, q, v, u, s, slipping, ages, now, loops, w, z, r, J)
         left = largest(p, r)
         if left > before and scale > SHORTEST:
             scale *= 0.5
-            for a in range(n):
-                z[a] += scale * change[a]
+            z += scale * change
             continue
         change, scale, before = np.linalg.solve(J, r), 1.0, left
-        for a in range(n):
-            z[a] -= change[a]
+        z -= change
         if largest(p, change) < SOLVED:
-            return finish(
-                p, h, C, X, shares, q, v, parts, u_dot, s, slipping, ages, now, z, which, d
-            )
+            return finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, ages, now, z, which, d)
     return False, 0.0, 0
 
 
 @njit(cache=True, nogil=True)
-def finish(p, h, C, X, shares, q, v, parts, u_dot, s, slipping, ages, now, z, which, d):
+def finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, ages, now, z, which, d):
     """Takes the velocities z over, unless a node touches the disc that was not looked at."""
-    u, u_slow, u_fast = parts
     soft, worn = now
-    forces, m, fastest, touching = np.empty((len(which), 2)), len(which), 0.0, 0
-    stretches, flags, looked, older = (
-        np.empty(s.shape),
-        np.zeros(s.shape, np.bool_),
-        np.zeros(s.shape, np.bool_),
-        np.zeros(s.shape),
-    )
+    fastest, touching, displaced = 0.0, 0, np.zeros(u.shape[1:])
+    stretches, flags, older = np.empty(s.shape), np.zeros(s.shape, np.bool_), np.zeros(s.shape)
     for k in range(2):
         for i in range(s.shape[1]):
             stretches[k, i] = relaxed(p, h, s[k, i])
-    for j in range(m):
+    apart = np.ones(s.shape, np.bool_)
+    for j in range(len(which)):
         k, i = which[j]
         rx, ry = z[5 + 2 * j] + k * z[3] - z[0], z[6 + 2 * j] + k * z[4] - z[1]
         mu_s, mu_k = friction(p, k, ages[k, i], worn)
-        law = node(p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], mu_s, mu_k)
-        forces[j, 0], forces[j, 1] = shares[j] * law[0], shares[j] * law[1]
-        stretches[k, i], flags[k, i], looked[k, i] = law[3], law[4], True
-        touches = law[0] != 0.0 or law[1] != 0.0
-        fastest, touching = max(fastest, law[5]), touching + touches
-        if touches:
-            older[k, i] = aged(p, h, ages[k, i], law[5])
-    rates, late, early = np.empty(u.shape), np.empty(u.shape), np.empty(u.shape)
+        fx, fy, _, stretch, flag, slip = node(
+            p, h, q[2], rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], mu_s, mu_k
+        )
+        stretches[k, i], flags[k, i], apart[k, i] = stretch, flag, False
+        fastest = max(fastest, slip)
+        if fx != 0.0 or fy != 0.0:
+            touching, older[k, i] = touching + 1, aged(p, h, ages[k, i], slip)
+        moved = shares[j] * (fx * C[k, :, 2 * i] + fy * C[k, :, 2 * i + 1])
+        displaced[k] += soft * moved.reshape(-1, 2)
+    parts, rate = retarded(p, h)
+    rates = np.empty(u.shape)
+    for m in range(3):
+        rates[m] = rate[m] * (parts[m] * displaced - u[m])
+    summed = rates.sum(0)
     for k in range(2):
-        for i in range(s.shape[1]):
-            far = 0.0
-            for a in range(2):
-                total = 0.0
-                for j in range(m):
-                    if which[j, 0] == k:
-                        for b in range(2):
-                            total += C[k, 2 * i + a, 2 * which[j, 1] + b] * forces[j, b]
-                total *= soft
-                late[k, i, a] = (p.slow * total - u_slow[k, i, a]) / (p.slow_tau + h)
-                early[k, i, a] = (p.fast * total - u_fast[k, i, a]) / (AT_ONCE + h)
-                rest = u[k, i, a] - u_slow[k, i, a] - u_fast[k, i, a]
-                main = (1 - p.slow - p.fast) * total - rest
-                rates[k, i, a] = main / (p.tau + h) + late[k, i, a] + early[k, i, a]
-                speed = rates[k, i, a] + k * z[3 + a] - z[a]
-                far += (X[k, i, a] + u[k, i, a] + k * q[3 + a] - q[a] + h * speed) ** 2
-            if not looked[k, i] and far < p.radius**2:
-                return False, 0.0, 0
-    for k in range(2):
-        for i in range(s.shape[1]):
-            u_dot[k, i], s[k, i], slipping[k, i] = rates[k, i], stretches[k, i], flags[k, i]
-            ages[k, i] = older[k, i]
-            for a in range(2):
-                u[k, i, a] += h * rates[k, i, a]
-                u_slow[k, i, a] += h * late[k, i, a]
-                u_fast[k, i, a] += h * early[k, i, a]
-    for a in range(5):
-        q[a] += h * z[a]
-        v[a] = z[a]
+        place = X[k] + u[:, k].sum(0) + k * q[3:] - q[:2]
+        place += h * (summed[k] + k * z[3:5] - z[:2])
+        if (apart[k] & ((place**2).sum(1) < p.radius**2)).any():
+            return False, 0.0, 0
+    u += h * rates
+    u_dot[:], s[:], slipping[:], ages[:] = summed, stretches, flags, older
+    q += h * z[:5]
+    v[:] = z[:5]
     return True, fastest, touching
 
 
@@ -390,7 +338,7 @@ def march(p, h, C, X, share, q, v, u, signals, every):
     steps, count = len(signals) - 1, X.shape[1]
     u_dot, s, slipping = np.zeros(u.shape), np.zeros((2, count)), np.zeros((2, count), np.bool_)
     rows, fastest, ages = np.zeros((steps // every + 1, 14)), 0.0, np.zeros((2, count))
-    parts = u, p.slow * u, p.fast * u
+    parts = np.stack(((1 - p.slow - p.fast) * u, p.slow * u, p.fast * u))
     held, past, before = np.empty(2), np.empty((int(p.delay / h) + 2, 2)), np.empty(2)
     loops, samples = (held, past, before), 0
     for i in range(steps + 1):
@@ -425,13 +373,7 @@ def march(p, h, C, X, share, q, v, u, signals, every):
             past[0] = held
         if i % every == 0:
             row = rows[i // every]
-            row[:5], row[5:10], row[10], row[11], row[12], row[13] = (
-                q,
-                v,
-                F_x,
-                F_y,
-                fastest,
-                touching,
-            )
+            row[:5], row[5:10] = q, v
+            row[10], row[11], row[12], row[13] = F_x, F_y, fastest, touching
             fastest = 0.0
     return rows, -1
