@@ -163,7 +163,7 @@ class _Solutions(torch.autograd.Function):
 
 def columned(bars: Array) -> Array:
     """Cotangents (., signals, 2) of signals, as (., 2 signals, 1)."""
-    return bars.reshape(len(bars), -1, 1)
+    return bars.reshape(len(bars), bars.shape[-2] * bars.shape[-1], 1)
 
 
 def run_adjoint(

@@ -22,8 +22,10 @@ from torchsoft.sysid.assumption_tests import EVIDENT, AssumptionTest, Linearised
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
 from torchsoft.sysid.plan import LOOSE, USUAL, continued, refine_steps, scanned
+from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.runs import EARLY
 from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
@@ -212,13 +214,10 @@ def search(
                 evaluations *= KEPT
             dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
             yield from ((test, None) for test in dropped)
-            best, explained = np.inf, False
-            for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
-                bar.set_description(plain(f"refit with {one.name} free"))
-                refit = completed(fits[one], finest, best + COMPARABLE)
+            explained = False
+            for one, refit in refits(fits, finest, bar):  # 3.
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
-                best = min(best, refit.square)
                 explained = explained or bool(test.suspected and test.passed)
             if explained:
                 return
@@ -245,6 +244,7 @@ def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised)
         start = fit_with(end, one.within(test.favoured))
     except ValueError:
         return None
+    steps = covering(end.at.steps, start.problem)
     c, step = start.problem.coordinates, np.zeros(len(start.x))
     for (label, move), sd in zip(test.moves.items(), linear.sd):
         step[c.labels.index(label)] = move * sd
@@ -256,13 +256,24 @@ def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised)
     times, best = times / max(1.0, longest / FIRST_STEP), None
     for part in PARTS:
         x = start.within_bounds(start.x + part * times * step)
-        at = start.residuals(x, steps=end.at.steps)
+        at = start.residuals(x, steps=steps)
         if not at.failed:
             fit = start._replace(x=x, at=at)
             best = fit if best is None or fit.square < best.square else best
         if best is not None and best.square < linear.square:
             break
     return best
+
+
+def covering(steps: Mapping[str, Frozen], problem: Problem) -> Mapping[str, Frozen]:
+    """Steps that go on to the end of the runs of a problem, which a delay of a sensor makes longer
+    than those of the fit."""
+    out = dict[str, Frozen]()
+    for one in (one for one in problem.recordings if one.name in steps):
+        knots, last = steps[one.name].knots, float(one.grid(problem.interpolated).t[-1])
+        later = [*np.arange(knots[-1] + EARLY, last, EARLY), last]
+        out[one.name] = Frozen(np.append(knots, later if last > knots[-1] else []))
+    return out
 
 
 def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
@@ -281,6 +292,18 @@ def carried_on(fit: Fit, evaluations: int) -> Fit:
     with suppress(Unreachable):
         return gauss_newton(fit, evaluations, ROUGH, anew=True)
     return fit
+
+
+def refits(
+    fits: Mapping[Suspect, Fit], finest: float, bar: "tqdm[Any]"
+) -> Iterator[tuple[Suspect, Fit]]:
+    """The fits, completed, the one that leaves least first."""
+    best = np.inf
+    for one in sorted(fits, key=lambda one: fits[one].square):
+        bar.set_description(plain(f"refit with {one.name} free"))
+        refit = completed(fits[one], finest, best + COMPARABLE)
+        best = min(best, refit.square)
+        yield one, refit
 
 
 def on_loose_steps(end: Fit) -> Fit:
