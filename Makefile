@@ -51,5 +51,5 @@ wheel: $(STAMP)
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
 clean:
-	rm -rf $(VENV) out docs/gallery build dist torchsoft/solve/kernel/objects *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) out docs/gallery docs/reference build dist torchsoft/solve/kernel/objects *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

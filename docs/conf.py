@@ -1,5 +1,5 @@
-"""Sphinx configuration: `make docs` executes chapters and gallery, and needs no network to be built
-or read."""
+"""Sphinx configuration: `make docs` generates the reference, executes chapters and gallery, and
+needs no network to be built or read."""
 
 import os
 import re
@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 from sphinx_gallery.scrapers import figure_rst, matplotlib_scraper
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
 project, author, copyright = "torchsoft", "the torchsoft authors", "the torchsoft authors"
 version = release = installed("torchsoft")
@@ -142,12 +142,20 @@ def plain(app: Sphinx, kind: str, name: str, thing: Any, options: Any, lines: li
     lines[:] = "".join(parts).split("\n")
 
 
+def generate(app: Sphinx) -> None:
+    """Write the reference from the declarations in the code."""
+    import reference
+
+    reference.write(ROOT / "docs" / "reference")
+
+
 def unset(app: Sphinx) -> None:
     """After the gallery, which sets it: kernels of chapters show figures by their own backend."""
     os.environ.pop("MPLBACKEND", None)
 
 
 def setup(app: Sphinx) -> None:
+    app.connect("builder-inited", generate)
     app.connect("builder-inited", unset, priority=900)
     app.connect("autodoc-process-docstring", plain)
     app.add_html_math_renderer("mathml", (mathml, None), (mathml, None))

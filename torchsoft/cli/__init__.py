@@ -73,10 +73,8 @@ def note_once() -> Callable[..., None]:
     return show
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command. The exit status is 0, 2 for an error that the user can fix, 130 for an
-    interruption."""
-    open_streams()
+def command_parser() -> argparse.ArgumentParser:
+    """The parser of `torchsoft` and of all its commands."""
     parser = argparse.ArgumentParser(
         prog="torchsoft", description="A differentiable simulator of soft contact manipulation."
     )
@@ -84,6 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for group in (rigs, plan, identify, profile, design, material, dataset, reduce, plot):
         group.add_commands(commands)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command. The exit status is 0, 2 for an error that the user can fix, 130 for an
+    interruption."""
+    open_streams()
     for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -91,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ["MPLBACKEND"] = "agg"  # pictures go to files, whatever windows are configured
     given = sys.argv[1:] if arguments is None else arguments
-    options = parser.parse_args(given)
+    options = command_parser().parse_args(given)
     if broken := [one for one in given if "\n" in one]:
         return failed(f"{broken[0]!r} has a line break in it; leave it out")
     options.command = shlex.join(

@@ -22,7 +22,7 @@ Which parameters explain these recordings, and how sure is that?
 DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta
 [deg]`, or runs of this project (.nc, .mcap). CONFIG.toml states what is known, what is
 unknown and how good the sensors are; examples/identify has both. Recordings that look wrong (a
-sign, a unit, set-points too far apart) are refused, or named, before anything is fitted. Writes
+sign, a unit, set-points too far apart) are rejected or reported before the fit. Writes
 answer.json and report.html, and comparison.json where there are competing laws. Interrupted, the
 same command continues where it was."""
 
@@ -30,10 +30,9 @@ same command continues where it was."""
 EXPLAIN = """\
 Why does the model not explain these recordings?
 
-Identifies as `identify` does, and where a misfit is left that no test of an assumption explains
-to first order, fits again without one assumption after the other until one explains the data,
-or until new fits took --effort times the work of the fit; the progress names which. With the
-checkpoint of an identification it begins where that ended."""
+Identifies as `identify` does. Where no test of an assumption explains the misfit, refits the data
+with one assumption released at a time, until one explains the data or the refits took --effort
+times the work of the fit. With the checkpoint of an identification it starts where that ended."""
 
 
 REHEARSE = """\
@@ -77,7 +76,7 @@ def add_arguments(one: argparse.ArgumentParser) -> None:
         one.add_argument(
             "--effort",
             type=float,
-            help="most work of new fits, over that of the fit itself (fit.effort)",
+            help="most work of refits, as a multiple of that of the fit (fit.effort)",
         )
     one.set_defaults(explains=verb == "explain", rehearses=verb == "rehearse")
 

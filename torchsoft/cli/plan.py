@@ -22,8 +22,8 @@ limit."""
 def add_commands(commands: Any) -> None:
     """Add the command `plan`."""
     one = add_command(commands, "plan", plan, "find a motion that reaches a goal", PLAN)
-    one.add_argument("rig", type=Path, metavar="RIG.toml")
-    one.add_argument("goal", type=Path, metavar="GOAL.toml")
+    one.add_argument("rig", type=Path, metavar="RIG.toml", help="the rig")
+    one.add_argument("goal", type=Path, metavar="GOAL.toml", help="the goal")
     meaning = "draw what an identification of the rig leaves unknown"
     one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=meaning)
     add_out(one, "plan")

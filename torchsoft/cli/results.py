@@ -41,7 +41,7 @@ def add_files(command: Any, help: str = "data files and a configuration") -> Non
 
 def add_yes(command: Any) -> None:
     """Add the option on costly work."""
-    meaning = "begin even what takes hours, or much memory or disk"
+    meaning = "start even if it takes hours, or much memory or disk"
     command.add_argument("--yes", action="store_true", help=meaning)
 
 
@@ -49,7 +49,7 @@ def add_progress(command: Any) -> None:
     """Add the option on progress, which is shown on terminals only."""
     command.add_argument(
         "--no-progress", dest="progress", action="store_false", default=sys.stderr.isatty(),
-        help="show no progress; only a terminal is shown any",
+        help="show no progress; files never get it",
     )  # fmt: skip
 
 

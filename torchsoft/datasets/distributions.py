@@ -32,6 +32,7 @@ class Related(Table):
     """A drawn parameter; with `ratio_to`, a multiple of the parameter of that name."""
 
     ratio_to: str | None = None
+    """another parameter: the drawn number is then multiplied by its value"""
 
     @property
     def related(self) -> str:
@@ -49,9 +50,13 @@ class Uniform(Related):
     is positive or negative with equal probability."""
 
     low: float
+    """lowest value [the parameter's unit]"""
     high: float
+    """highest value [the parameter's unit]"""
     scale: Literal["linear", "log"] = "linear"
+    """"log": draw the logarithm uniformly"""
     either_sign: bool = False
+    """true: positive or negative with equal probability"""
 
     @model_validator(mode="after")
     def _is_ordered(self) -> Self:
@@ -90,9 +95,13 @@ class Normal(Related):
     default four standard deviations from the mean."""
 
     mean: float
+    """mean [the parameter's unit]"""
     sd: float = Field(gt=0)
+    """standard deviation [the parameter's unit]"""
     low: float = math.nan
+    """lower bound; four standard deviations below the mean if not given [the parameter's unit]"""
     high: float = math.nan
+    """upper bound; four standard deviations above the mean if not given [the parameter's unit]"""
     scale: ClassVar[Literal["linear"]] = "linear"
 
     @model_validator(mode="before")
@@ -152,6 +161,7 @@ class Choice(Related):
     """One of the numbers `choices`, with equal probability."""
 
     choices: Annotated[tuple[float, ...], LISTED] = Field(min_length=1, max_length=10_000)
+    """values, drawn with equal probability [the parameter's unit]"""
     scale: ClassVar[Literal["linear"]] = "linear"
 
     @property
@@ -196,13 +206,13 @@ class Kind(Table):
     them."""
 
     name: str = Field(min_length=1, max_length=100)
-    """in the array `kind`"""
+    """name in the array `kind`"""
     weight: float = Field(default=1.0, ge=1e-6, le=1e6)
-    """by which it is drawn"""
+    """relative frequency of this kind [1]"""
     fixed: dict[str, Any] = Field(default_factory=dict)
-    """values in it, or whole tables such as a motion, by the names of the rig file's tables"""
+    """fields or whole tables of the rig file, such as a motion, by dotted name"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
-    """distributions of its own, added to those of all kinds, or in their place"""
+    """distributions of this kind, added to those of all kinds or in place of them"""
 
 
 def in_ratio(

@@ -19,7 +19,9 @@ class Fractions(Table):
     """Fractions of the trajectories; the rest is for testing."""
 
     train: float = Field(0.7, gt=0, lt=1)
+    """fraction of the trajectories for training [1]"""
     validation: float = Field(0.15, ge=0, lt=1)
+    """fraction for validation [1]"""
 
     @model_validator(mode="after")
     def _leave_some_for_testing(self) -> Self:
@@ -35,47 +37,48 @@ class Fields(Table):
     whole."""
 
     title: str
-    """of the card and of pictures"""
+    """title of the card and of pictures"""
     description: str = ""
-    """a paragraph of the card"""
+    """paragraph of the card"""
     license: str = ""
-    """of the data, by its name in SPDX, such as CC-BY-4.0"""
+    """license of the data, by its name in SPDX, such as CC-BY-4.0"""
     seed: int = Field(ge=0, le=SEED)
-    """of the design, the splits and random phases"""
+    """seed of the design, the splits and random phases"""
     trajectories: int = Field(ge=1, le=10_000_000)
-    """of the whole set"""
+    """number of trajectories"""
     trajectories_per_shard: int = Field(16, ge=1, le=100_000)
-    """what a worker makes at once, what its memory holds, and what a file of an array holds"""
+    """trajectories that a worker simulates at once and keeps in memory, and that a file holds"""
     samples_per_chunk: int = Field(250, ge=1, le=10_000_000)
-    """of one trajectory, read and decompressed at once"""
+    """samples of one trajectory that are read and decompressed at once"""
     duration: float = Field(ge=1e-3, le=1e4)
-    """of every trajectory [s]; that of the rig file by default"""
+    """duration of every trajectory; that of the rig file if not given [s]"""
     sample_interval: float = Field(5e-3, ge=1e-6, le=1.0)
-    """between samples [s]; that of the rig file by default"""
+    """time between samples; that of the rig file if not given [s]"""
     rtol: float | None = Field(None, ge=1e-9, le=1e-2)
-    """relative tolerance of the stepper [1]; 1e-4 by default, or what the rig file says"""
+    """relative tolerance of the steps; that of the rig file or else 1e-4 if not given [1]"""
     step: float | None = Field(None, ge=1e-6, le=STEP)
-    """equal steps no longer than this [s] instead"""
+    """length of equal steps at most, in place of `rtol` [s]"""
     node_precision: Literal["float32", "float64"] = "float32"
-    """of everything that is kept per node; the rest is float64"""
+    """type of arrays per contact point; all others are float64"""
     ledger_tolerance: float = Field(0.02, ge=1e-12, le=1.0)
-    """largest energy residual over the energy injected [1] that the check accepts"""
+    """largest energy residual, over the energy injected, that the check accepts [1]"""
     splits: Fractions = Fractions(train=0.7, validation=0.15)
     """fractions of the trajectories; the rest is for testing"""
     fixed: dict[str, Any] = Field(default_factory=dict)
-    """parameters that differ from the rig file in every trajectory"""
+    """fields of the rig file that differ in all trajectories, by dotted name"""
     parameters: dict[str, Distribution] = Field(default_factory=dict)
-    """distributions of the parameters that differ between trajectories, by name"""
+    """distributions of the parameters that differ between trajectories, by dotted name"""
     kinds: Annotated[tuple[Kind, ...], LISTED] = Field((), max_length=100)
-    """kinds of trajectories, such as those of one motion or another; one kind by default"""
+    """kinds of trajectories, such as one for each motion"""
     rig: dict[str, Any]
-    """the tables of the rig file; its name, from the folder of the configuration, in a TOML file"""
+    """rig file, relative to the configuration's folder, or the name of a ready rig; its tables in
+    Python"""
     files: dict[str, str] = Field(default_factory=dict)
     """contents of the files that the rig file names, in base 64"""
     channels: Annotated[tuple[str, ...], LISTED] | None = None
-    """channels of the rig that are kept; all by default"""
+    """channels to keep; all of them if not given"""
     nodal: bool = True
-    """whether forces and displacements of every contact point are kept"""
+    """true: keep forces and displacements of every contact point"""
 
     @model_validator(mode="before")
     @classmethod

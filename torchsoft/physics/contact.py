@@ -320,10 +320,10 @@ class SoftContact(LawPart):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
     R_n, R_t [N.s/m], and a friction law. `weight` scales them to the length of surface that a point
     stands for. With a `power` m [1] the normal spring's force is K_n g_0 (g / g_0)^m, g_0 being
-    `REFERENCE_DEPTH`. An `adhesion` A [N] pulls with A g / (g + `ADHERING_DEPTH`) while the point
-    touches, and adds to the force that friction follows (Derjaguin, Muller and Toporov). Friction
-    is `friction_ratio` [1] times that of its law. The age of a contact starts at touch-down, and
-    out of contact it fades within `FADING`."""
+    0.1 mm. An `adhesion` A [N] pulls with A g / (g + 1 um) while the point touches, and adds to the
+    force that friction follows (Derjaguin, Muller and Toporov). Friction is `friction_ratio` [1]
+    times that of its law. The age of a contact starts at touch-down, and out of contact it fades
+    within 10 ms."""
 
     def __init__(
         self,

@@ -563,10 +563,10 @@ class Taxels:
     Raises `ValueError` unless one of count and centres is given, and for numbers out of range.
     """
 
-    pad: str
+    pad: Annotated[str, "name of one of the pads"]
     width: Annotated[Length, "width of a taxel along the surface"]
     _: KW_ONLY
-    count: int | None = None
+    count: Annotated[int | None, "number of taxels, side by side around the middle"] = None
     centres: Annotated[
         Iterable[float], Quantity("m", -100.0, 100.0, "middles along the surface, from its middle")
     ] = ()

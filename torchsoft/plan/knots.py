@@ -22,10 +22,12 @@ PEAK = 35 / 16
 
 
 class Range(Table):
-    """Values from `low` to `high` [their unit]."""
+    """Range of a value."""
 
     low: float
+    """lowest value [its unit]"""
     high: float
+    """highest value [its unit]"""
 
     @model_validator(mode="after")
     def _is_ordered(self) -> Self:
@@ -35,11 +37,12 @@ class Range(Table):
 
 
 class Bounds(Range):
-    """Bounds of a signal of the reference: values from `low` to `high` [its unit], at `speed` [its
-    unit/s] at most. The values of knots later than `after` [s] are free."""
+    """Bounds of a signal of the reference, whose knots the search may move."""
 
     speed: float = Field(gt=0)
+    """largest rate of the signal [its unit/s]"""
     after: float = 0.0
+    """time after which the values of knots are free [s]"""
 
 
 def profile(reference: Reference, name: str) -> Profile:

@@ -36,13 +36,16 @@ def samples(run: Trajectory, channel: str) -> Tensor:
 
 
 class Target(Table):
-    """Target for a channel: `value` [its unit] at the time `at` [s], by default the end of the run,
-    within `tolerance`."""
+    """Target for a channel at one time."""
 
     channel: str
+    """name of a channel of the run"""
     value: float
+    """value to reach [the channel's unit]"""
     tolerance: float = Field(gt=0)
+    """permitted error [the channel's unit]"""
     at: float | None = None
+    """time at which it is reached; the end of the run if not given [s]"""
 
     def __call__(self, run: Trajectory) -> Tensor:
         """Error () over the tolerance, interpolated linearly between outputs."""
@@ -58,14 +61,18 @@ class Target(Table):
 
 
 class Limit(Table):
-    """Limit of a channel: between `low` and `high` [its unit], one of which may be missing, from
-    `since` to `until` [s]."""
+    """Limit of a channel over a time; `low` or `high` may be missing, not both."""
 
     channel: str
+    """name of a channel of the run"""
     low: float | None = None
+    """lower limit; none if not given [the channel's unit]"""
     high: float | None = None
+    """upper limit; none if not given [the channel's unit]"""
     since: float | None = None
+    """time from which it holds; the start of the run if not given [s]"""
     until: float | None = None
+    """time until which it holds; the end of the run if not given [s]"""
 
     @model_validator(mode="after")
     def _has_a_bound(self) -> Self:

@@ -195,17 +195,16 @@ class ActuatorTable(Group):
     lag: Lag | None = Field(
         default=None,
         description="time constant of a first-order lag of the whole effort, as drives have it, "
-        "which begins settled; none if not given",
+        "initially settled; none if not given",
     )
     limit: EffortLimit | None = Field(
         default=None,
-        description="largest size of the whole effort [N or N.m], at which it saturates; an "
-        "integral goes on; none if not given",
+        description="largest size of the whole effort, at which it saturates; an integral goes "
+        "on; none if not given",
     )
     reversed: bool = Field(
         default=False,
-        description="the gains push the other way, for a q that falls where the pushed coordinate "
-        "rises",
+        description="true: reverse the gains, for a q that falls where the pushed coordinate rises",
     )
     network: str | None = Field(
         default=None,

@@ -27,21 +27,32 @@ Name = Annotated[str, Field(min_length=1)]
 
 
 class Goal(Table):
-    """Goal of a run of a rig file: `free` motions and parameters of the file, by their names;
-    `targets` and `limits` of channels; `uncertain` parameters of the file, of which the plan sees
-    `draws` besides their stated values."""
+    """Goal of a run of a rig file. The plan keeps it for the stated values of `uncertain`
+    parameters and for random draws of them."""
 
     free: dict[Name, Bounds | Range] = Field(min_length=1)
+    """motions and parameters of the rig file that the plan may change, by name; parameters have
+    `low` and `high` only"""
     targets: dict[Name, Target] = Field(min_length=1)
+    """targets of channels, by a name of your choice"""
     limits: dict[Name, Limit] = Field(default_factory=dict)
+    """limits of channels, by a name of your choice"""
     uncertain: dict[Name, Range] = Field(default_factory=dict)
+    """ranges of parameters that are not known exactly, by name"""
     draws: int = Field(default=8, ge=1, le=10_000)
+    """random values of the uncertain parameters that the plan takes into account"""
     method: Method = "slsqp"
+    """optimiser: "slsqp" uses sequential quadratic programming, "adam" first-order steps"""
     iterations: int = Field(default=50, ge=1, le=100_000)
+    """iterations at most"""
     starts: int = Field(default=1, ge=1, le=4096)
+    """number of initial plans"""
     seconds: float = Field(default=1e6, gt=0)
+    """time after which the search stops [s]"""
     rtol: float = Field(default=RTOL, ge=1e-7, le=1e-2)
+    """relative tolerance of the simulations [1]"""
     seed: int = Field(default=0, ge=0, le=SEED)
+    """seed of the initial plans and of the draws"""
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:

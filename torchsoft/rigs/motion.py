@@ -111,7 +111,7 @@ class HoldTable(Motion):
 
     kind: Literal["hold"] = "hold"
     value: Value = Field(
-        default=START, description=f'"{START}": where the coordinate that follows starts'
+        default=START, description=f'"{START}": initial value of the coordinate that follows'
     )
 
     def build(self, context: MotionContext) -> Piecewise:
@@ -121,15 +121,15 @@ class HoldTable(Motion):
 class Knots(Motion):
     """Values at given times."""
 
-    times: Times = Field(description="increasing; constant before the first and after the last [s]")
+    times: Times = Field(description="increasing times; values are constant before and after [s]")
     values: Values = Field(
-        description=f'one per time; "{START}": where the coordinate that follows starts; "{HELD}", '
-        "of a feed-forward: the effort that holds its coordinate where set-points are then, pads "
-        "in balance without friction"
+        description=f'one per time; "{START}": initial value of the coordinate that follows; '
+        f'"{HELD}", of efforts fed forward: the static effort, without friction, that holds the '
+        "coordinate at the set-points of that time"
     )
     offset: Value = Field(
         default=0.0,
-        description=f'added to all values; "{START}": where the coordinate that follows starts',
+        description=f'added to all values; "{START}": initial value of the coordinate that follows',
     )
 
     @model_validator(mode="after")
@@ -169,15 +169,16 @@ class StrokesTable(Motion):
 
     kind: Literal["strokes"] = "strokes"
     travel: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(
-        description="how far, to the side of its sign"
+        description="length of a stroke, with its sign"
     )
-    stroke_time: Time = Field(description="each way", gt=0)
+    stroke_time: Time = Field(description="duration of one stroke", gt=0)
     offset: Value = Field(
-        default=START, description=f'the near end; "{START}": where the coordinate starts'
+        default=START,
+        description=f'value at the near end; "{START}": initial value of the coordinate',
     )
-    since: Time = Field(default=0.0, description="when the first stroke begins")
+    since: Time = Field(default=0.0, description="start of the first stroke")
     until: Time | None = Field(
-        default=None, description="when the last one has ended; the end of the run if not given"
+        default=None, description="end of the last stroke; the end of the run if not given"
     )
 
     def build(self, context: MotionContext) -> Piecewise:
@@ -207,16 +208,16 @@ class ModulatedMotion(Knots):
     """Waves on top of a profile, from `since` to `until`, where they come and go."""
 
     times: Times = Field(
-        default=(0.0,), description="of the profile that the waves are added to [s]"
+        default=(0.0,), description="times of the profile that the waves are added to [s]"
     )
     values: Values = Field(
         default=(START,),
-        description=f'of the profile; "{START}": where the coordinate that follows starts',
+        description=f'values of it; "{START}": initial value of the coordinate that follows',
     )
-    since: Time = Field(default=0.0, description="when the waves begin; they come within 0.15 s")
+    since: Time = Field(default=0.0, description="start of the waves, which fade in over 0.15 s")
     until: Time | None = Field(
         default=None,
-        description="when they have gone, again within 0.15 s; the end of the run if not given",
+        description="end of the waves, which fade out over 0.15 s; the end of the run if not given",
     )
 
     def window(self, context: MotionContext) -> tuple[float, float]:
@@ -269,13 +270,17 @@ class MultiSineTable(ModulatedMotion):
 
     kind: Literal["multi_sine"] = "multi_sine"
     amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(
-        description="of the sum, at most"
+        description="largest amplitude of the sum"
     )
     band: Annotated[tuple[Frequency, Frequency], LISTED] = Field(
         description="lowest and highest frequency [Hz]"
     )
-    components: Annotated[int, Field(ge=1, le=100)] = Field(default=5, description="how many sines")
-    seed: Annotated[int, Field(ge=0, le=SEED)] = Field(default=0, description="of what is random")
+    components: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=5, description="number of sines"
+    )
+    seed: Annotated[int, Field(ge=0, le=SEED)] = Field(
+        default=0, description="seed of phases and frequencies"
+    )
 
     def fastest(self) -> float:
         return max(self.band)
@@ -296,8 +301,8 @@ class ChirpTable(ModulatedMotion):
     amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(
         description="amplitude"
     )
-    first: Frequency = Field(description="frequency at its begin")
-    last: Frequency = Field(description="frequency at its end")
+    first: Frequency = Field(description="initial frequency")
+    last: Frequency = Field(description="final frequency")
 
     def fastest(self) -> float:
         return max(self.first, self.last)
@@ -319,14 +324,14 @@ class CsvTable(Motion):
     column: str = Field(description="the column's name, without its unit")
     time: str = Field(default="t", description="the name of the column of times, without its unit")
     from_first: bool = Field(
-        default=False, description="whether times count from the first row, as of a clock's"
+        default=False, description="true: the first row has time zero, as for the times of a clock"
     )
     scale: Annotated[float, Quantity("1", -1e6, 1e6)] = Field(
-        default=1.0, description="the factor of the column, -1 for one of the opposite sign"
+        default=1.0, description="factor of the column; -1 reverses its sign"
     )
     offset: Value = Field(
         default=0.0,
-        description=f'what is added then; "{START}": where the coordinate that follows starts',
+        description=f'added after scaling; "{START}": initial value of the coordinate that follows',
     )
 
     def build(self, context: MotionContext) -> Piecewise:

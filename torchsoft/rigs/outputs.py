@@ -17,24 +17,24 @@ ROWS = 1_000_000
 class OutputsTable(Group):
     """Duration of the run, and files to be written."""
 
-    duration: Annotated[float, Quantity("s", 1e-3, 1e5)] = Field(description="of the run")
+    duration: Annotated[float, Quantity("s", 1e-3, 1e5)] = Field(description="duration of the run")
     interval: Annotated[float, Quantity("s", 1e-6, 1e3)] = Field(
-        default=0.01, description="between outputs"
+        default=0.01, description="time between outputs"
     )
     figures: bool = Field(default=True, description="write the figures")
     player: bool | None = Field(
-        default=None, description="write player.html; as figures says if not given"
+        default=None, description="write player.html; as `figures` if not given"
     )
     snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
         default=(),
-        description="times of the pictures in snapshots.png; six over the whole run if none is "
-        "given [s]",
+        description="times of the pictures in snapshots.png; six of the whole run if none is given "
+        "[s]",
     )
     video: Literal["gif", "mp4", "none"] = Field(
         default="gif", description="kind of the video, or none; mp4 needs imageio-ffmpeg"
     )
     frames: Annotated[int, Field(ge=2, le=10_000)] = Field(
-        default=150, description="pictures of the video, 12 a second"
+        default=150, description="pictures of the video, 12 per second"
     )
     follow: str = Field(
         default="",
@@ -79,10 +79,10 @@ class SolverTable(Group):
         description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given",
     )
     step: Annotated[float, Quantity("s", 1e-7, 1.0)] | None = Field(
-        default=None, description="equal steps no longer than this instead"
+        default=None, description="length of equal steps at most, in place of rtol"
     )
     tolerance: Annotated[float, Quantity("N", 1e-10, 1e-3)] = Field(
-        default=1e-9, description="Newton's, on every nodal force"
+        default=1e-9, description="tolerance of Newton's method on every nodal force"
     )
 
     @model_validator(mode="after")

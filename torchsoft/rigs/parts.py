@@ -59,7 +59,7 @@ class ContourTable(PartTable):
     kind: Literal["contour"] = "contour"
     file: str = Field(description="the CSV file, from the folder of this one")
     tolerance: Annotated[float, Quantity("m", 1e-9, 1e-2)] = Field(
-        default=1e-6, description="how far the contour may pass the points"
+        default=1e-6, description="largest distance of the contour from the points"
     )
 
     def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
@@ -88,8 +88,7 @@ class DepthTable(Group):
     """A start below "touch"."""
 
     depth: Annotated[float, Quantity("m", -10.0, 10.0)] = Field(
-        description="by which the pads of the body and those under it give way together; clear of "
-        "them where it is negative"
+        description='how far below "touch" the body starts; negative: how far above'
     )
 
 
@@ -97,7 +96,7 @@ class ForceTable(Group):
     """A start under a load."""
 
     force: Annotated[float, Quantity("N", 0.0, 1e6)] = Field(
-        description="that presses the body down, besides its weight"
+        description="force that presses the body down, in addition to its weight"
     )
 
 
@@ -118,13 +117,12 @@ class StartTable(Group):
         Discriminator(height),
     ] = Field(
         default=None,
-        description='centre of mass, upwards; "rest": where it lies under its weight, the loops '
-        'off; "touch": where the pads bonded to it, undeformed, come down upon what they touch; '
-        "{depth = 1e-3}: lower than that [m]; {force = 20.0}: where it is in balance when it is "
-        "pressed down [N]",
+        description='centre of mass, upwards; "rest": equilibrium under its weight, controllers '
+        'off; "touch": the undeformed pads bonded to it just touch what is below; '
+        "`{depth = 1e-3}`: lower than that; `{force = 20.0}`: equilibrium under that load as well",
     )
     theta: Annotated[float | str | None, NumberOr("rad", REST, optional=True)] = Field(
-        default=None, description='anticlockwise, 0 if not given; "rest" as for y'
+        default=None, description='angle, anticlockwise, 0 if not given; "rest" as for y'
     )
     v_x: Annotated[float, Quantity("m/s", -1e3, 1e3)] = Field(default=0.0, description="velocity")
     v_y: Annotated[float, Quantity("m/s", -1e3, 1e3)] = Field(default=0.0, description="velocity")
@@ -146,16 +144,16 @@ class BodyTable(Group):
         description="density, which gives the mass of its shape; steel has 7800, aluminium 2700",
     )
     depth: Depth | None = Field(
-        default=None, description="how deep it is, out of the plane; goes with density"
+        default=None, description="depth out of the plane; needed with density"
     )
     x: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(
-        default="free", description="to the right"
+        default="free", description="centre of mass, to the right"
     )
     y: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(
-        default="free", description="upwards"
+        default="free", description="centre of mass, upwards"
     )
     theta: Annotated[float | str, NumberOr("rad", "free", "driven")] = Field(
-        default="free", description="anticlockwise"
+        default="free", description="angle, anticlockwise"
     )
     inertia: Inertia | None = Field(
         default=None, description="moment of inertia; that of its shape if not given"
@@ -168,16 +166,19 @@ class BodyTable(Group):
     weighted: bool = Field(default=True, description="whether gravity acts on it")
     symbol: str = Field(
         default="",
-        description="what its channels are called: x_SYMBOL and so on; its name if not given",
+        description="name in its channels, x_SYMBOL and so on; the body's name if not given",
     )
     shape: ShapeTable | None = Field(
-        default=None, description="what touches pads; not needed where nothing touches it"
+        default=None, description="contour; not needed for a body without contacts"
     )
     centre_x: Offset = Field(
         default=0.0, description="centre of mass in the frame of its shape, along the body's own x"
     )
-    centre_y: Offset = Field(default=0.0, description="the same along the body's own y")
+    centre_y: Offset = Field(
+        default=0.0, description="centre of mass in the frame of its shape, along the body's own y"
+    )
     start: StartTable = StartTable()
+    """pose and rates at the start of the run"""
 
     @property
     def freedom(self) -> dict[str, float | str]:
@@ -363,20 +364,19 @@ class PadTable(PartTable):
         default=None, description="name of the body that it is bonded to; the ground if not given"
     )
     origin: Annotated[tuple[Place, Place], LISTED] = Field(
-        default=(0.0, 0.0), description="where its own origin is, in the base's own frame [m]"
+        default=(0.0, 0.0), description="position of its origin in the frame of its base [m]"
     )
-    angle: Angle = Field(
-        default=0.0, description="by which it is turned about its origin, anticlockwise"
-    )
+    angle: Angle = Field(default=0.0, description="rotation about its origin, anticlockwise")
     mirrored: bool = Field(
-        default=False, description="upside down: its free surface faces down (before it is turned)"
+        default=False,
+        description="true: upside down, the free surface faces down before the rotation",
     )
     inertial: bool = Field(
         default=False,
-        description="with mass at every node; true costs time and changes next to nothing",
+        description="true: every node has mass; slower, with nearly the same result",
     )
     points: Annotated[int, Field(ge=0, le=8)] = Field(
-        default=0, description="contact points an element; 0 puts one on every node"
+        default=0, description="contact points per element; 0 puts one on every node"
     )
 
     def mesh(self, folder: Path) -> Mesh:
@@ -413,7 +413,7 @@ class MeshTable(PadTable):
     part = QuadMesh.read
     kind: Literal["mesh"] = "mesh"
     file: str = Field(description="the mesh file, from the folder of this one")
-    unit: Literal["m", "cm", "mm"] = Field(description="of the coordinates in the file")
+    unit: Literal["m", "cm", "mm"] = Field(description="unit of the coordinates in the file")
     face: str = Field(default="face", description="group of lines that is the free surface")
     bonded_edges: Annotated[tuple[str, ...], LISTED, Field(min_length=1, max_length=100)] = Field(
         default=("base",), description="groups of lines that are bonded"
@@ -516,13 +516,16 @@ else:
     LawTable = table_of(
         SoftContact,
         base=SpringsTable,
-        friction=one_of(
-            table_of(SmoothSlip, "smooth"),
-            table_of(Coulomb, "coulomb"),
-            table_of(RateAndState, "rate_and_state"),
-            table_of(AgeingSlip, "ageing"),
-            CodeTable,
-        ),
+        friction=Annotated[
+            one_of(
+                table_of(SmoothSlip, "smooth"),
+                table_of(Coulomb, "coulomb"),
+                table_of(RateAndState, "rate_and_state"),
+                table_of(AgeingSlip, "ageing"),
+                CodeTable,
+            ),
+            "law of friction",
+        ],
         **{
             name: Annotated[signature(SoftContact).parameters[name].annotation, OrAuto()]
             for name in ("K_n", "R_n", "K_t", "R_t")

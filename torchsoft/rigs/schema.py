@@ -51,26 +51,37 @@ Names = Annotated[tuple[str, ...], LISTED, Field(min_length=1)]
 class RigTables(Group):
     """All tables of a rig file."""
 
-    title: str = Field(default="", description="what it is")
-    gravity: Gravity = Field(default=9.81, description="acts downwards")
+    title: str = Field(default="", description="title of the rig")
+    gravity: Gravity = Field(default=9.81, description="gravitational acceleration, downwards")
     bodies: dict[str, BodyTable] = Field(min_length=1)
+    """rigid bodies, by name"""
     materials: dict[str, MaterialTable] = Field(min_length=1)
+    """materials of pads, by name"""
     pads: dict[str, AnyPad] = Field(min_length=1)
+    """soft pads, by name"""
     laws: dict[str, LawTable] = Field(min_length=1)
+    """contact laws, by name"""
     contacts: dict[str, ContactTable] = Field(min_length=1)
+    """pairs of a pad and a body that may touch, by name"""
     taxels: dict[str, TaxelsTable] = Field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
+    """arrays of taxels on pads, by name"""
     actuators: dict[str, ActuatorTable] = Field(default_factory=dict)
+    """single actuators, by name"""
     controllers: dict[str, ControllerTable] = Field(default_factory=dict)
+    """controllers of several coordinates, by name"""
     motion: dict[str, MotionTable] = Field(default_factory=dict)
+    """set-points, efforts fed forward and motions of driven coordinates, by name"""
     names: dict[str, str | Names] = Field(
         default_factory=dict,
-        description="short names of entries of the file and of channels, for typing",
+        description="aliases of entries of the file and of channels",
     )
     sources: dict[str, str] = Field(
-        default_factory=dict, description="where numbers come from, published or assumed"
+        default_factory=dict, description="published or assumed, and where, by the name of a value"
     )
     outputs: OutputsTable
+    """duration of the run, and files to write"""
     solver: SolverTable = SolverTable()
+    """choice of the steps"""
     _folder: Path = PrivateAttr(default_factory=Path)
 
     @property

@@ -62,13 +62,23 @@ class Settings(Table):
     """Settings of a fit, which are arguments of `identify`."""
 
     rtol: float = Field(RTOL, ge=1e-8, le=1e-2)
+    """relative tolerance of the simulations in the last stage [1]"""
     starts: int = Field(1, ge=1, le=2**20)
+    """number of initial values for the first stage, from a Sobol sequence"""
     loss: Loss = "linear"
+    """loss function of the residuals; the last two limit the influence of outliers"""
     workers: int = Field(1, ge=1, le=1000)
+    """threads, one recording each"""
     seed: int = Field(0, ge=0, le=SEED)
+    """seed of the initial values"""
     tightenings: int = Field(2, ge=0, le=10)
+    """how often the fit may continue at a tenth of the tolerance where the discretisation error
+    shifts estimates"""
     assumptions: Assumed = "checked"
+    """"checked": score tests of assumptions; "explained": also refits that look for the cause of a
+    misfit; "trusted": no tests"""
     effort: float = Field(EFFORT, gt=0, le=1e6)
+    """work of refits, as a multiple of that of the fit, after which no new one starts [1]"""
 
 
 @single_threaded()

@@ -35,8 +35,12 @@ class Prior(Table):
     "log-normal", where `sd` is that of the natural logarithm."""
 
     median: float
+    """median of the prior [the unknown's unit]"""
     sd: float = Field(gt=0, le=1e12)
+    """standard deviation of the value or, if log-normal, of its natural logarithm [the unknown's
+    unit or 1]"""
     kind: Literal["normal", "log-normal"] = "normal"
+    """distribution of the value"""
 
     @model_validator(mode="after")
     def _has_a_logarithm(self) -> Self:
@@ -53,24 +57,27 @@ class Prior(Table):
 
 
 class Unknown(Table):
-    """One parameter to identify, by its name in the rig or its short one, user-defined laws
-    included.
+    """One parameter to identify, by its name in the rig or its alias, user-defined laws included.
 
-    `nominal` is the start of the search, by default the value of the recordings' own rigs; with
-    `ratio_to`, value, nominal, bounds and prior are those of the ratio to that other parameter, and
-    `fixed` besides ties the two. Bounds must lie within the parameter's own (`Rig.quantity`). With
-    `per` = "recording" every recording has a value of its own. A `prior` counts as one more
-    measurement.
+    Bounds must lie within the parameter's own (`Rig.quantity`).
     """
 
     nominal: float | None = None
+    """initial value of the search; that of the rig file if not given [the parameter's unit]"""
     low: float | None = None
+    """lower bound; that of the parameter itself if not given [the parameter's unit]"""
     high: float | None = None
+    """upper bound; that of the parameter itself if not given [the parameter's unit]"""
     scale: Literal["log", "linear"] = "log"
+    """scale of the search; `linear` needs `low` and `high`, `log` needs positive values"""
     ratio_to: str | None = None
+    """another parameter: value, bounds and prior are then ratios to it"""
     fixed: bool = False
+    """true: hold the value at `nominal`; with `ratio_to`, hold the ratio"""
     per: Per = "all"
+    """one value for all recordings, or one for each"""
     prior: Prior | None = None
+    """prior distribution, which counts as one more measurement"""
 
     @model_validator(mode="after")
     def _bounds_are_ordered(self) -> Self:
@@ -126,38 +133,45 @@ FAULTS: dict[str, Fault] = {
 
 
 class Sensor(Table):
-    """A measured channel: standard deviation of its noise [the channel's unit], largest size of its
-    faults, and its range.
+    """A measured channel: its noise, the largest size of its faults, and its range.
 
-    Faults are a constant `bias` [unit], a `delay` [s], an error of its `gain` [1], a `drift`
-    [unit/s] from the middle of the recording on, its `misalignment` [rad] about the axis out of the
-    plane; the `inertia` [kg] between a force sensor and the body that it pushes, whose acceleration
-    it does not feel; the `clock` [1] that runs too fast, counted from the middle of the recording;
-    the `lag` [s], the time constant of a low-pass of first order that rests at the first sample;
-    the `backlash` [unit], the width of the play of a gear, in the middle of which it starts.
-    Zero leaves a fault out; others are identified, one for all recordings or one for each (`per`).
-    Samples at `low` or `high` [unit] or beyond are saturated: they only say that value plus noise
-    is there or beyond (Tobin's likelihood), and the noise must be white. Readings in steps of a
-    `resolution` [unit] have the additional variance of a twelfth of its square. `colour` is "white"
-    for independent noise, or "ar" for an autoregression, whose order and coefficients are then
-    estimated.
+    A fault of size zero is left out; others are identified. A saturated sample states only that
+    value plus noise is at that end of the range or beyond (Tobin's likelihood); the noise must be
+    white then.
     """
 
     noise: float = Field(ge=1e-15, le=1e6)
+    """standard deviation of the noise [the channel's unit]"""
     bias: float = Field(default=0.0, ge=0, le=1e6)
+    """largest constant offset [the channel's unit]"""
     delay: float = Field(default=0.0, ge=0, le=REACH)
+    """largest delay [s]"""
     gain: float = Field(default=0.0, ge=0, le=0.5)
+    """largest relative error of the gain [1]"""
     drift: float = Field(default=0.0, ge=0, le=1e6)
+    """largest drift, counted from the middle of the recording [the channel's unit/s]"""
     misalignment: float = Field(default=0.0, ge=0, le=0.5)
+    """largest rotation of the sensor about the axis out of the plane [rad]"""
     inertia: float = Field(default=0.0, ge=0, le=1e5)
+    """largest mass between a force sensor and the body that it pushes; the sensor does not measure
+    the force that accelerates it [kg]"""
     clock: float = Field(default=0.0, ge=0, le=0.1)
+    """largest relative error of the sensor's clock, counted from the middle of the recording [1]"""
     lag: float = Field(default=0.0, ge=0, le=REACH)
+    """largest time constant of a first-order low-pass filter, in equilibrium at the first sample
+    [s]"""
     backlash: float = Field(default=0.0, ge=0, le=1e6)
+    """largest width of a backlash, centred at the first sample [the channel's unit]"""
     resolution: float = Field(default=0.0, ge=0, le=1e6)
+    """step of the readings; adds a variance of its square over twelve [the channel's unit]"""
     per: Per = "all"
+    """one value of each fault for all recordings, or one for each"""
     low: float | None = None
+    """lower end of the range; samples at or below it are saturated [the channel's unit]"""
     high: float | None = None
+    """upper end of the range; samples at or above it are saturated [the channel's unit]"""
     colour: Literal["white", "ar"] = "white"
+    """"white" for independent noise; "ar" for an autoregression with estimated coefficients"""
 
     @model_validator(mode="after")
     def _has_a_range(self) -> Self:
