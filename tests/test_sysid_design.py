@@ -232,7 +232,7 @@ theta_disc.noise = 5e-4
 x_lower.noise = 1e-5
 effort_lift.noise = 0.05
 [design]
-iterations = 4
+iterations = 8
 rtol = 1e-3
 limits.x_upper = [-0.03, 0.05]
 [design.candidates]

@@ -143,9 +143,13 @@ def identify(
 def completed(
     answer: IdentificationResult, looks: Sequence[Finding], wall_s: float
 ) -> IdentificationResult:
-    """The answer with what was found before the fit, the gravest findings first, and the time that
-    it took [s]."""
-    findings = sorted([*looks, *answer.findings], key=lambda one: SEVERITIES.index(one.severity))
+    """The answer with what was found before the fit, the cause of a misfit and the gravest findings
+    first, and the time that it took [s]."""
+
+    def order(one: Finding) -> tuple[bool, int]:
+        return one.code not in ("cause", "causes"), SEVERITIES.index(one.severity)
+
+    findings = sorted([*looks, *answer.findings], key=order)
     return replace(answer, findings=findings, cost=answer.cost | {"wall_s": wall_s})
 
 

@@ -205,10 +205,12 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "The data contradict that {stated}: the sum of squares falls by {gain:.0f} with {cases}.",
         "{estimate} would move by {shift:.2g} standard deviations; estimates under it: {under}.",
         "The refit with {unconverged} free has not converged, so it has no estimates.",
+        "Correct it, or make it an unknown, and identify again.",
     ),
     "causes": (
         "The data contradict one of {count} assumptions, and cannot tell which: {cases}.",
         "The sum of squares falls by {gain:.0f}; estimates under one or another: {between}.",
+        "Measure one of them, or record a motion that tells them apart.",
     ),
     "rivals": (
         "The data contradict one of {count} assumptions: {cases}.",
@@ -387,7 +389,7 @@ def worded(value: Any, clauses: Sequence[str]) -> Any:
         return ", ".join(f"{name} = {ranged(one)}" for name, one in value.items())
     if isinstance(value, list | tuple):
         names = [one for one in value if isinstance(one, str)]
-        return ", ".join(names) or listed([case(clauses, one) for one in value])
+        return listed(names or [case(clauses, one) for one in value])
     return value
 
 
