@@ -76,7 +76,7 @@ class Drawn(NamedTuple):
         if reason := self._unlike(self._values({})):
             raise ValueError(f"{within} in their middle: {reason}")
 
-    def _values(self, given: Mapping[str, float]) -> dict[str, float]:
+    def _values(self, given: dict[str, float]) -> dict[str, float]:
         """All parameters, some of them as given and the others at their medians."""
         middle = {name: one.at(MIDDLE) for name, one in self.parameters.items()}
         return in_ratio(self.file, self.parameters, middle | given)

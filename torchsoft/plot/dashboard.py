@@ -79,7 +79,7 @@ class Chart(NamedTuple):
     name: str
     label: str
     unit: str
-    curves: Mapping[str, Array]
+    curves: dict[str, Array]
 
     def coloured(self) -> Iterator[tuple[str, Array, str]]:
         """Name, values and colour of every curve."""
