@@ -5,7 +5,7 @@ Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, stresses
 mJ.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
