@@ -18,6 +18,7 @@ the spin), more than 100 times faster than the full model; k, c and the masses w
 expectation but for the spin's k (-11 %) and c_r (-16 %). Half a minute on one core.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from experiments.frame import COARSE, Table, grid, numbers, options, write
 from torchsoft import Profile, Reference, Rig, RigFile, hold, simulate
 from torchsoft.files import finite
 from torchsoft.physics.motion import Waves, wave
-from torchsoft.reduced.fit import Recipe, assemble, choose, loop, rollout_of, score
+from torchsoft.reduced.fit import Recipe, assemble, choose, fit, loop, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, record, rolling_radius
 from torchsoft.reduced.terms import mechanics
@@ -62,6 +63,18 @@ class Config:
     thresholds: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3)
     models: int = 50  # members of an ensemble
     smoke: bool = False  # a size that takes seconds
+
+
+def refit(
+    records: Sequence[Record], model: ReducedModel, recipe: Recipe, config: Config
+) -> ReducedModel:
+    """A regression on just the terms of a model, in which none is left out."""
+    terms = {target: [term for term, _ in pairs] for target, pairs in model.equations().items()}
+    return fit(
+        assemble(records, terms, recipe),
+        replace(recipe, threshold=0.0, models=config.models),
+        model.feedback,
+    )
 
 
 def rollout_time(model: ReducedModel, on: Record, repeats: int = 9) -> float:
@@ -165,10 +178,10 @@ def study(config: Config) -> dict[str, Any]:
         grasp.move(waves, 1.0, step=5e-4, sample=1e-3),
         grasp.move(aside, 1.2, step=2e-3, sample=4e-3),
     ]
-    taps = tapped(grasp, config)
-    recipe = Recipe(models=config.models, width=0.004, window=config.tap_time)
+    taps, recipe = tapped(grasp, config), Recipe(width=0.004, window=config.tap_time)
     problem = assemble(taps, mechanics(r), recipe)
-    reduced = choose(problem, tests, recipe, config.thresholds, loop(taps)).model
+    choice = choose(problem, tests, recipe, config.thresholds, loop(taps))
+    reduced = refit(taps, choice.model, recipe, config)
     full = [
         whole.run(grid(config.scenario * file.outputs.duration, 2e-3))
         for _ in range(1 if config.smoke else 3)
