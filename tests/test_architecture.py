@@ -29,7 +29,7 @@ FLOWS = {
     "physics.mesh": "mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",
     "solve": """
-        kernel laws steps progress model system stepper trajectory gradients formats
+        kernel laws steps progress model parameters stepper gradients trajectory netcdf vtk mcap
         diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
@@ -49,8 +49,8 @@ FLOWS = {
     """,
     "cli": "results rigs plan identify profile design material dataset reduce plot .",
     "solve.kernel": """
-        table arrays objects . invoke linear sources contacts condensed nodal pads domain stage step
-        run adjoint tangent build
+        table arrays objects . invoke linear sources contacts condensed nodal transport pads domain
+        stage step run adjoint tangent build
     """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's

@@ -1,4 +1,4 @@
-"""Compiled laws against torch: values, Jacobians and pullbacks of every operation, also at kinks
+"""Compiled laws against torch: values, Jacobians and pulls of every operation, also at kinks
 and singular places; what torch does not differentiate; what is rejected."""
 
 import threading
@@ -13,23 +13,29 @@ from torch.nn import functional as F
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from torchsoft.codegen import UnknownOperation, compile_law, emit, operations
-from torchsoft.solve.kernel.invoke import call_linearise, call_pullback, call_value
+from torchsoft.solve.kernel.invoke import call_linearise, call_pull, call_push, call_value
 
 
 @numba.njit(nogil=True)
-def _call_all(value, linearise, pullback, x, p, w, out, again, J, p_bar):
+def _call_all(value, linearise, push, pull, x, p, d, w, out, again, J, along, p_bar):
     call_value(value, x, p, out)
     call_linearise(linearise, x, p, again, J)
-    call_pullback(pullback, x, p, w, p_bar)
+    call_push(push, x, p, d, along)
+    call_pull(pull, x, p, w, p_bar)
 
 
 def _compiled(law, x, p, w, start=0.0):
-    """Value, Jacobian, and what the pullback adds to the start."""
+    """Value, Jacobian, and what the pull adds to the start, whose transpose the push is."""
     x, p, w = (torch.as_tensor(one, dtype=torch.float64).numpy() for one in (x, p, w))
     out, again = np.empty(law.outputs), np.empty(law.outputs)
     J, p_bar = np.empty((law.linear, law.differentiated)), np.full(law.parameters, start)
-    _call_all(law.value, law.linearise, law.pullback, x, p, w, out, again, J, p_bar)
+    d, along = np.linspace(0.3, 1.1, law.parameters), np.empty(law.linear)
+    entries = law.value, law.linearise, law.push, law.pull
+    _call_all(*entries, x, p, d, w, out, again, J, along, p_bar)
     np.testing.assert_array_equal(out, again)
+    parts, weighted = d * (p_bar - start), w[w != 0] * along[w != 0]
+    size = max(np.abs(parts).max(initial=1.0), np.abs(weighted).max(initial=1.0))
+    np.testing.assert_allclose(weighted.sum(), parts.sum(), rtol=1e-11, atol=1e-12 * size)
     return out, J, p_bar
 
 
@@ -265,7 +271,7 @@ def test_a_singular_branch_that_is_not_chosen_leaves_no_trace(of):
         assert (*out, *J.ravel(), *p_bar) == (-2 * x, -2 * x, -2.0, -2.0, -x)
 
 
-def test_an_output_of_zero_weight_leaves_no_trace_in_the_pullback():
+def test_an_output_of_zero_weight_leaves_no_trace_in_the_pull():
     law = lambda x, p: torch.sqrt(x * p["a"])
     compiled = compile_law(law, torch.ones(2).double(), _numbers(a=1.0))
     assert _compiled(compiled, [0.0, 4.0], [0.0], [0.0, 0.0])[2][0] == 0.0
@@ -296,7 +302,7 @@ def test_where_torch_records_no_derivative_a_law_has_none(law):
     _assert_equal_to_torch(law, _points(3), _numbers(a=0.4))
 
 
-def test_leading_outputs_and_inputs_are_chosen_and_the_pullback_accumulates():
+def test_leading_outputs_and_inputs_are_chosen_and_the_pull_accumulates():
     law = lambda x, p: torch.cat([x * p["a"], x**2])
     compiled = compile_law(law, _points(3)[0], _numbers(a=2.0), linear=2, differentiated=1)
     _, J, p_bar = _compiled(compiled, [1.0, 2.0, 3.0], [2.0], [1.0, 10.0], start=10.0)

@@ -42,7 +42,7 @@ from torchsoft.datasets.generate import (
 from torchsoft.datasets.subject import Task, split
 from torchsoft.datasets.writer import Store, create, open_or_create
 from torchsoft.rigs import RigFile
-from torchsoft.solve.formats import read_log, write_log
+from torchsoft.solve.mcap import read_log, write_log
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid.columns import read_table

@@ -5,9 +5,12 @@ import pytest
 import torch
 from conftest import coarse, f64, random_state
 
-from torchsoft import simulate
+from torchsoft import Body, Rig, simulate
 from torchsoft.physics.energy import stored
+from torchsoft.physics.multibond import topology
+from torchsoft.physics.parts import Actuator, Guide
 from torchsoft.rigs import RigFile
+from torchsoft.testing import check_energy
 
 
 def test_stored_energies_by_hand():
@@ -46,3 +49,25 @@ def test_the_energy_residual_of_a_fall_falls_with_the_tolerance():
     assert runs[1].energy_residual_rel < 0.2 * runs[0].energy_residual_rel
     flight = [float(run.energy_residual[run.t < 0.02].abs().max()) for run in runs]
     assert max(flight) < 1e-9 * float(runs[0].injected[-1])
+
+
+def test_a_guide_is_a_resistance():
+    """Its power is dissipated, not supplied, and equals the energy that a free body loses."""
+    guides = {
+        axis: Actuator(f"slider.{axis}", f"slider.{axis}", Guide(*numbers), setpoint=(),
+                       elements=(f"R: guide of {axis}",))
+        for axis, numbers in (("x", (0.3, 2.0)), ("theta", (1e-3, 5e-3)))
+    }  # fmt: skip
+    body = Body(0.5, y=0.0, inertia=1e-3, weighted=False)
+    rig = Rig(bodies={"slider": body}, pads={}, contacts={}, actuators=guides)
+    y0 = rig.state(slider={"x": 0.0, "v_x": 0.4, "omega": 3.0})
+    run = check_energy(rig, torch.linspace(0.0, 1.0, 51), y0, rtol=1e-6)
+    for axis, kinetic in (("x", "slider"), ("theta", "slider_spin")):
+        lost = run.energy[kinetic][0] - run.energy[kinetic]
+        assert torch.allclose(run.dissipated[f"control_{axis}"], lost, rtol=1e-3, atol=1e-9)
+    assert {*run.supplied} == {"gravity"}
+    assert float(run.injected[-1]) == 0.0
+    graph = topology(rig.evaluate(0.0, rig.unpack(y0)).ports, rig.junctions)
+    assert graph.nodes["control_x: R: guide of x"]["kind"] == "R"
+    assert ("control_x", "control_x: R: guide of x") in graph.edges  # power goes in
+    assert ("slider", "control_x") in graph.edges

@@ -277,7 +277,7 @@ REJECTED: list[tuple[dict[str, Any], str]] = [
     ({"reward": lambda *_: 0.0}, "give either a `goal` or a `reward`"),
     ({"goal": TargetPose("disk", {"x": 0.0}, {"x": 1.0})}, "`goal.target` names `disk.x`; did"),
     ({"goal": TargetPose("disc", {"x": 0.0}, {"y": 1.0})}, "must have the coordinates of"),
-    ({"bounds": {"lower.y": (0, 1)}}, "`bounds` names `lower.y`; did you mean `lower.x`? (free are disc.x"),
+    ({"bounds": {"lower.y": (0, 1)}}, "`lower.y`; did you mean `lower.x`? (free are disc.x"),
     ({"held": ["disk"]}, "`held` names `disk`; did you mean `disc`"),
     ({"parameters": {"materials.rubber.e": (1, 2)}}, "is not in the rig file"),
     ({"parameters": {"materials.rubber.nu": (0.4, 0.6)}}, "= 0.6: "),

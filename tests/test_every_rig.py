@@ -381,7 +381,7 @@ def test_compiled_steps_are_the_module_s(start, y):
     segments: list[Segment] = []
     stepper = ImplicitStepper(rig, step=h, tolerance=NEWTON)
     *_, last = stepper.integrate(y, f64(0.0, h), segments, float("inf"))
-    assert last.steps == 1
+    assert last.stats.steps == 1
     assert segments[-1].tapes is not None
     star, a = torch.from_numpy(segments[-1].tapes[0].y), GAMMA * h
     assert torch.equal(star[0], y)

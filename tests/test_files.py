@@ -20,7 +20,7 @@ from torchsoft.files import (
 from torchsoft.physics.mesh.quads import read_quads
 from torchsoft.rigs.control import LOOP, read_network
 from torchsoft.rigs.motion import read_column
-from torchsoft.solve.formats import load
+from torchsoft.solve.netcdf import load
 from torchsoft.sysid.result import load_answer
 from torchsoft.tables import line, plain, read_toml
 

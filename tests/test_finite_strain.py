@@ -33,8 +33,7 @@ from torchsoft import (
 from torchsoft.codegen import compile_law
 from torchsoft.physics import elements
 from torchsoft.physics.elements import element_constants, element_potentials
-from torchsoft.physics.hyperelastic import invariants, plane
-from torchsoft.physics.setup import PadSetup
+from torchsoft.physics.hyperelastic import described, invariants, plane
 from torchsoft.solve.kernel.arrays import LANES
 from torchsoft.solve.laws import Factors, as_law, element
 from torchsoft.testing import CheckFailed, check_energy
@@ -97,7 +96,7 @@ def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kin
     given = torch.stack(x, -1).numpy()
     for address, arrays in (
         (law.linearise, (given, p, out, J)),
-        (law.pullback, (given, p, w, bar)),
+        (law.pull, (given, p, w, bar)),
     ):
         call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(address)
         call(*(one.ctypes.data for one in arrays))
@@ -294,7 +293,7 @@ def test_ogdens_sums_are_smooth_where_stretches_are_equal():
 
 def test_cauchys_stress_is_that_of_theory():
     rubber = energy("neo_hookean")
-    setup = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), rubber))
+    setup = Pad(PadMesh(4e-3, 3e-3, 4, 3), rubber)
     F = np.array([[1.2, 0.3], [-0.1, 0.75]])
     u = setup.mesh.nodes @ (F - np.eye(2)).T
     J, b = np.linalg.det(F), np.eye(3)
@@ -307,7 +306,8 @@ def test_cauchys_stress_is_that_of_theory():
     U = setup.strain(u)[0] + [1, 1, 0]
     stretches = np.linalg.eigvalsh([[U[0], U[2]], [U[2], U[1]]])
     assert stretches == pytest.approx(np.sort(np.linalg.svd(F)[1]), rel=1e-10)
-    custom = PadSetup.of(Pad(PadMesh(4e-3, 3e-3, 4, 3), Bent(lambda F: F[..., 0, 0])))
+    custom = Pad(PadMesh(4e-3, 3e-3, 4, 3), Bent(lambda F: F[..., 0, 0]))
+    custom = Pad.again(custom.described(), custom.mesh)
     with pytest.raises(ValueError, match="one of your own"):
         custom.stress(u)
 
@@ -379,7 +379,7 @@ def test_a_run_is_kept_in_files_and_shown(run, tmp_path):
     loaded = Trajectory.load(tmp_path / "run.nc")
     assert torch.equal(loaded.y, run.y)
     pad = loaded.setup.pads["L"]
-    assert pad.energy == {"rho": 1100.0, **RELAXING}
+    assert described(pad.material) == {"rho": 1100.0, **RELAXING}
     u = run.displacement["L"][-1].numpy()
     assert pad.stress(pad.displacement(u)).min() < -5e4
     assert 0.05 < pad.largest_strain(u) < 0.5
@@ -398,7 +398,7 @@ def let_go(material: Any, force: Tensor, times: Tensor) -> Tensor:
     if pad.nodal:
         linear, mesh = pad.condensed(), pad.mesh
         u = (linear.compliance() @ force.flatten()).unflatten(0, (-1, 2)).detach().numpy()
-        whole = PadSetup.of(linear).displacement(u)[mesh.free]
+        whole = linear.displacement(u)[mesh.free]
         part = torch.from_numpy(np.tile(whole, pad.fields))
     still = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
     y0 = rig.pack(still._replace(pads={"floor": part}))

@@ -14,7 +14,17 @@ from conftest import COARSE, RUBBER, coarse, grasped, random_state, still, times
 
 from torchsoft import NeoHookean, RateAndState, Rig, simulate
 from torchsoft.codegen import compile_law
-from torchsoft.solve.kernel import adjoint, contacts, linear, nodal, pads, sources, stage, tangent
+from torchsoft.solve.kernel import (
+    adjoint,
+    contacts,
+    linear,
+    nodal,
+    pads,
+    sources,
+    stage,
+    tangent,
+    transport,
+)
 from torchsoft.solve.kernel.arrays import GAMMA, INSTANT, scratch
 from torchsoft.solve.kernel.invoke import call_linearise
 from torchsoft.solve.progress import Segment
@@ -30,7 +40,7 @@ RIGS: dict[str, Callable[[], Rig]] = {
 }
 STEP = 2e-4
 ANY = np.random.default_rng(0)
-LAWS = {"value": "xpo", "linearise": "xpoJ", "pullback": "xpwb", "push": "xpdo"}
+LAWS = {"value": "xpo", "linearise": "xpoJ", "pull": "xpwb", "push": "xpdo"}
 
 
 def called(*arrays: str) -> Any:
@@ -50,7 +60,7 @@ def called(*arrays: str) -> Any:
 @pytest.fixture(autouse=True)
 def plain(monkeypatch):
     """Kernels are plain functions where nothing has compiled them; laws are called by ctypes."""
-    for module in (contacts, nodal, sources, stage, tangent, adjoint):
+    for module in (contacts, nodal, sources, stage, transport):
         for name, arrays in LAWS.items():
             monkeypatch.setattr(module, f"call_{name}", called(*arrays), raising=False)
 
@@ -70,7 +80,7 @@ def first_stage(name: str) -> Stage:
     stepper, t = ImplicitStepper(rig, step=STEP), times(10 * STEP, 2)
     with torch.no_grad():
         [*stepper.integrate(random_state(rig, 3), t, segments, float("inf"))]
-    rig, size = stepper.compiled.system, stepper.layout.size
+    rig, size = stepper.parameters.system, stepper.layout.size
     work = scratch("Work", rig, size, columns=2)
     return Stage(rig, work, segments[-1].tapes, segments[-1].stages, size)
 
@@ -135,22 +145,24 @@ def test_the_adjoint_of_a_stage_is_its_tangent_transposed(name, forces):
     forces of a stage of no length."""
     rig, work, tapes, signals, size = first_stage(name)
     tape, row, a = (tapes[1], 0, INSTANT) if forces else (tapes[0], 1, GAMMA * STEP)
-    z, back = scratch("Tangents", rig, size, columns=2), scratch("Cotangents", rig, size)
+    along, back = (scratch("Directions", rig, size, columns=n) for n in (2, 1))
     start = np.maximum(abs(tape.y[row]), 1e-6)[:, None] * ANY.normal(size=(size, 2))
     dp, dy = abs(rig.p)[:, None] * ANY.normal(size=(len(rig.p), 2)), start.copy()
     dw = 1e-3 * ANY.normal(size=(signals[row].size, 2))
-    dw[2 * rig.source_signal.size :] = 0.0  # those of fixed and driven bodies
-    pads.find_spans(rig, tape.y[row], dy, z.span)
-    tangent.stage_tangent(rig, work, z, tape, row, a, signals[row], dy, dp, dw, forces)
-    out = z.recorded.copy() if forces else dy
+    dw[2 * rig.body_signal[rig.body_signal >= 0]] = 0.0  # of fixed and driven bodies
+    dw[2 * rig.body_signal[rig.body_signal >= 0] + 1] = 0.0
+    pads.find_spans(rig, tape.y[row], dy, along.span)
+    tangent.stage_tangent(rig, work, along, tape, row, a, signals[row], dy, dp, dw, forces)
+    out = along.recorded.copy() if forces else dy
     bar = ANY.normal(size=len(out)) / np.maximum(abs(out).max(1), 1e-12)
-    y_bar, p_bar = np.zeros(size) if forces else bar.copy(), np.zeros(len(rig.p))
-    w_bar = np.zeros(signals[row].shape)
+    y_bar = np.zeros((size, 1)) if forces else bar[:, None].copy()
+    p_bar, w_bar = np.zeros((len(rig.p), 1)), np.zeros((signals[row].size, 1))
+    if forces:
+        back.recorded[:, 0] = bar
     adjoint.stage_adjoint(
-        rig, work, back, tape, row, a, signals[row], y_bar, p_bar, w_bar,
-        bar if forces else np.zeros(0),
+        rig, work, back, tape, row, a, signals[row], y_bar, p_bar, w_bar, forces
     )  # fmt: skip
-    backwards = y_bar @ start + p_bar @ dp + w_bar.ravel() @ dw
+    backwards = y_bar[:, 0] @ start + p_bar[:, 0] @ dp + w_bar[:, 0] @ dw
     assert backwards == pytest.approx(bar @ out, rel=1e-8)
 
 

@@ -1,5 +1,5 @@
-"""Object files of the kernels: named after what they are made from, checked before they are used,
-made again where they are missing; and the tables that kernels take."""
+"""The object file of the kernels: named after what it is made from, checked before it is used, made
+again where it is missing; and the tables that kernels take."""
 
 import errno
 import os
@@ -30,16 +30,16 @@ def folder(tmp_path, monkeypatch):
 
 def kept() -> Path:
     """The file of an object that was just kept."""
-    objects.keep("run", objects.level(), MACHINE_CODE)
-    return objects.FOLDERS[0] / f"run-{objects.level()}.o"
+    objects.keep(objects.level(), MACHINE_CODE)
+    return objects.FOLDERS[0] / f"{objects.level()}.o"
 
 
 def test_an_object_is_found_in_any_folder_and_written_to_the_first(folder, monkeypatch, capsys):
-    assert objects.found("run") is None
+    assert objects.found() is None
     assert kept().stat().st_mode & 0o777 == 0o644
     first = folder.parent / "first"
     monkeypatch.setattr(objects, "FOLDERS", [first, folder])
-    assert objects.found("run") == MACHINE_CODE
+    assert objects.found() == MACHINE_CODE
     assert kept().parent == first
     assert capsys.readouterr().err == ""
 
@@ -49,8 +49,8 @@ UNUSABLE: dict[str, tuple[Any, str]] = {
        for kind, how in BYTES.items()},
     "others may write": (lambda path: path.chmod(0o666), "that other users may change"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), ""),
-    "another kernel's": (lambda path: path.with_name(
-        f"backward-{objects.level()}.o").write_bytes(path.read_bytes()), "damaged"),
+    "another level's": (lambda path: (objects.keep("other", MACHINE_CODE),
+                                      path.with_name("other.o").replace(path)), "damaged"),
 }  # fmt: skip
 if os.getuid() == 0:
     UNUSABLE["of another user"] = (lambda path: os.chown(path, 12345, 12345), "other users")
@@ -61,11 +61,11 @@ def test_an_object_that_may_be_another_is_not_used(folder, kind, capsys):
     """One line says why, and it is made again."""
     spoil, why = UNUSABLE[kind]
     spoil(kept())
-    assert objects.found("backward" if kind == "another kernel's" else "run") is None
+    assert objects.found() is None
     told = capsys.readouterr().err
     assert why in told
     assert told.count("\n") == bool(why)
-    assert kept().is_dir() or objects.found("run") == MACHINE_CODE
+    assert kept().is_dir() or objects.found() == MACHINE_CODE
 
 
 def test_objects_are_named_after_all_that_is_compiled_and_the_processor(
@@ -80,12 +80,12 @@ def test_objects_are_named_after_all_that_is_compiled_and_the_processor(
         names.add(objects.digest(tmp_path / "sources"))
     assert len(names) == 4
     content = kept().read_bytes()
-    (folder / "run-elsewhere.o").write_bytes(content)
+    (folder / "elsewhere.o").write_bytes(content)
     monkeypatch.setattr(objects, "level", lambda: "elsewhere")
-    assert objects.found("run") is None
+    assert objects.found() is None
     monkeypatch.setattr(objects, "NAME", "older")  # the sources changed since this process started
     with pytest.raises(RuntimeError, match="start it again"):
-        objects.load("run")
+        objects.load()
 
 
 def full(*_: object) -> None:
@@ -106,10 +106,10 @@ def test_where_nothing_can_be_kept_one_line_says_so(folder, monkeypatch, capsys,
 
 
 def test_a_second_process_waits_for_the_first_and_takes_its_kernels(folder, monkeypatch, capsys):
-    monkeypatch.setattr(objects, "compile_missing", lambda name: pytest.fail("compiled twice"))
+    monkeypatch.setattr(objects, "compile_missing", lambda: pytest.fail("compiled twice"))
     with ThreadPoolExecutor(1) as pool:
         with objects.alone():
-            second = pool.submit(objects.build, "run")
+            second = pool.submit(objects.build)
             with pytest.raises(TimeoutError):
                 second.result(0.2)
             kept()
@@ -162,14 +162,14 @@ def test_kernels_are_built_for_every_level_and_here_to_the_same_bytes(tmp_path):
     """So that a run from an object has the bits of one that was compiled for it."""
     levels = [name for name in objects.LEVELS if name != "native" or objects.level() == name]
     chosen = [word for name in levels for word in ("--level", name)]
-    command = [sys.executable, "-m", "torchsoft.solve.kernel.build", "rates", "--out", tmp_path]
+    command = [sys.executable, "-m", "torchsoft.solve.kernel.build", "--out", tmp_path]
     subprocess.run([*command, *chosen], check=True, capture_output=True)
     made = {path.name: path.read_bytes() for path in (tmp_path / objects.NAME).iterdir()}
-    assert set(made) == {f"rates-{name}.o" for name in levels}
-    assert made[f"rates-{objects.level()}.o"] == (objects.found("rates") or objects.build("rates"))
+    assert set(made) == {f"{name}.o" for name in levels}
+    assert made[f"{objects.level()}.o"] == (objects.found() or objects.build())
     machines = {name: content[18] for name, content in made.items() if content[:4] == b"\x7fELF"}
-    assert machines.get("rates-linux-aarch64.o") == 183
-    assert machines.get("rates-linux-x86-64-v2.o") == 62
+    assert machines.get("linux-aarch64.o") == 183
+    assert machines.get("linux-x86-64-v2.o") == 62
 
 
 # tables

@@ -11,7 +11,7 @@ from conftest import coarse, f64, grasped, times
 from torchsoft import SimulationFailed, Trajectory, simulate
 from torchsoft.envs import reorient
 from torchsoft.solve import model as models
-from torchsoft.solve.system import Compiled
+from torchsoft.solve.parameters import Parameters
 
 T = times(0.02, 5)
 
@@ -27,20 +27,33 @@ def test_rigs_of_one_structure_share_a_model(monkeypatch):
     """Whatever their parameters; another geometry or attribute makes another model. As many are
     kept as fit, the last one always."""
     rig = coarse()
-    first = Compiled(rig).model
+    first = Parameters(rig).model
     with torch.no_grad():
         (other := copy.deepcopy(rig)).parameter("pad.E").mul_(1.1)
-    assert Compiled(other).model is Compiled(coarse(pad__E=6e5)).model is first
+    assert Parameters(other).model is Parameters(coarse(pad__E=6e5)).model is first
     with torch.no_grad():
         other.parameter("disc.radius").mul_(1.001)
     leaving = copy.deepcopy(rig)
     leaving.contacts["L"].may_leave = True
-    assert first not in (Compiled(other).model, Compiled(leaving).model)
-    assert Compiled(rig).model is first
+    assert first not in (Parameters(other).model, Parameters(leaving).model)
+    assert Parameters(rig).model is first
     monkeypatch.setattr(models, "KEPT_BYTES", first.bytes)
-    second = Compiled(coarse(pad__elements_x=24)).model
-    assert Compiled(coarse(pad__elements_x=24)).model is second
-    assert Compiled(rig).model is not first
+    second = Parameters(coarse(pad__elements_x=24)).model
+    assert Parameters(coarse(pad__elements_x=24)).model is second
+    assert Parameters(rig).model is not first
+
+
+def test_the_vector_of_parameters_has_a_table_of_names():
+    """By the names in the file and in the module, with what is computed of them and its graph."""
+    rig = coarse()
+    found = Parameters(rig)
+    E = rig.parameter("materials.rubber.E")
+    for name in ("materials.rubber.E", "pads.L.material.E"):
+        assert found[name].tolist() == [E.item()]
+    softness = 1 / (E * rig.pads["L"].material.depth)
+    assert found["chain of L"].tolist() == pytest.approx([1.0, 0.01, softness.item(), 0.45])
+    (slope,) = torch.autograd.grad(found["chain of L"][2], E)
+    assert slope.item() == pytest.approx((-softness / E).item())
 
 
 @pytest.mark.parametrize("left", [0.1, float("nan")])
@@ -50,7 +63,7 @@ def test_a_room_is_as_good_as_new(left):
     y0 = grasped(rig, (0.05, 0.0))
     models.forget()
     expected = simulate(rig, T, y0=y0, rtol=1e-4)
-    model = Compiled(rig).model
+    model = Parameters(rig).model
     (used,) = model._idle
     ground = used.work.q[-3:].copy()  # which no run writes to
     for part in (*used.work, *used.step, used.system.p):
@@ -96,5 +109,5 @@ def test_a_step_in_the_room_of_another_is_that_of_a_graph():
             assert torch.equal(one, other.detach())
         assert torch.equal(done.observation, graph.observation.detach())
         assert torch.equal(done.knots, graph.knots)
-        assert same(done.outcome.trajectory(), graph.outcome.trajectory())
+        assert same(Trajectory.of(done.solved), Trajectory.of(graph.solved))
         now = done.moment

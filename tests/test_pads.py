@@ -22,7 +22,19 @@ from skfem import (
     solve,
 )
 
-from torchsoft import CurvedPadMesh, FingertipMesh, KelvinVoigt, Pad, PadMesh, QuadMesh, Taxels
+from torchsoft import (
+    CurvedPadMesh,
+    FingertipMesh,
+    GeneralisedKelvin,
+    KelvinVoigt,
+    Ogden,
+    Pad,
+    PadMesh,
+    Prony,
+    QuadMesh,
+    StandardLinearSolid,
+    Taxels,
+)
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 
 ROUNDING, SOLVED = 1e-12, 1e-10
@@ -422,3 +434,32 @@ def test_elements_too_slender_to_be_computed_with_are_rejected():
     with pytest.raises(ValueError, match=r"elements of 5e-08 m by 10 m are too slender"):
         PadMesh(1e-6, 10.0, 20, 1)
     PadMesh(1.0, 1e-3, 20, 1)
+
+
+def test_a_pad_is_made_again_of_its_description():
+    """With its material, place and ratios; of a material of one's own the relaxed stiffness."""
+
+    class Own(KelvinVoigt):
+        pass
+
+    mesh, small = PadMesh(8e-3, 4e-3, 4, 2), (0.45, 1100.0)
+    for material in (
+        KelvinVoigt(7e5, *small, 0.01, 0.04), Own(7e5, *small, 0.01, 0.04),
+        StandardLinearSolid(7e5, 9e5, *small, 0.1, 0.04),
+        GeneralisedKelvin(7e5, *small, 0.04, [0.2, 0.1], [0.1, 1.0]),
+        Prony(7e5, *small, 0.04, [1e5, 2e5], [0.1, 1.0]),
+        Ogden([2e5, 1e4], [1.3, 5.0], *small, 0.01, 0.04, [1e5], [0.2]),
+    ):  # fmt: skip
+        pad = Pad(mesh, material, base="hand", origin=(1e-3, 2e-3), angle=0.3, mirrored=True,
+                  points=2, E_ratio=1.2)  # fmt: skip
+        again = Pad.again(pad.described(), mesh)
+        assert again.described() == pad.described()
+        assert torch.equal(again.point_positions, pad.point_positions)
+        u = np.random.default_rng(0).normal(scale=1e-5, size=(pad.nodes, 2))
+        whole = pad.displacement(u)
+        assert np.array_equal(again.stress(whole), pad.stress(whole))
+        if type(material) is Own:
+            with pytest.raises(NotImplementedError):
+                again.chain()
+        else:
+            assert all(map(torch.equal, again.chain(), pad.chain()))

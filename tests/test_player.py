@@ -1,10 +1,10 @@
 """The interactive player, in a real browser where there is one."""
 
+import copy
 import json
 import re
 import shutil
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,12 @@ def test_the_file_holds_everything(run, tmp_path):
     assert {"disc", "bracket"} == {*data["bodies"]}
 
 
+def with_forces(run: Trajectory, force: dict[str, torch.Tensor]) -> Trajectory:
+    changed = copy.copy(run)
+    changed.force = force
+    return changed
+
+
 def first_shown(run: Trajectory, path: Path) -> int:
     player(run, path, frames=30)
     data = held(path)
@@ -80,11 +86,11 @@ def test_it_opens_when_all_contacts_are_closed(run, tmp_path):
     assert min(lower[row], upper[row]) > 10.0
     assert 0 < row < run.at(0.375)
     never = run.force | {"U": torch.zeros_like(run.force["U"])}
-    row = first_shown(replace(run, force=never), tmp_path / "run.html")
+    row = first_shown(with_forces(run, never), tmp_path / "run.html")
     assert lower[row] > 0.5 * lower.max() > lower[row - 2]
     impact = torch.ones(51, 1, 1)
     impact[24:27] = 100.0
-    struck = replace(run, force={name: impact * x for name, x in run.force.items()})
+    struck = with_forces(run, {name: impact * x for name, x in run.force.items()})
     assert 24 <= first_shown(struck, tmp_path / "run.html") <= 26
 
 
@@ -171,7 +177,7 @@ def test_what_a_file_does_not_resolve_is_nothing(page, values):
 
 
 def test_forces_of_nothing_are_none(run):
-    still = replace(run, force={k: x * torch.tensor([1.0, 1e-13]) for k, x in run.force.items()})
+    still = with_forces(run, {k: x * torch.tensor([1.0, 1e-13]) for k, x in run.force.items()})
     series = {one["name"]: one["series"] for one in charts(still, [*range(51)])}
     assert all(one["values"]["step"] == one["values"]["low"] == 0 for one in series["friction"])
     assert all(one["values"]["step"] > 0 for one in series["normal force"])

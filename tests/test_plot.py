@@ -14,7 +14,7 @@ from scipy.spatial.distance import pdist
 
 from torchsoft import Rig, Trajectory
 from torchsoft.physics.mesh import lame_moduli
-from torchsoft.physics.setup import von_mises
+from torchsoft.physics.pads import von_mises
 from torchsoft.plot import figures
 from torchsoft.plot.animation import animate, frame_times
 from torchsoft.plot.dashboard import dashboard, energy_groups
@@ -79,7 +79,7 @@ def test_stress_of_a_uniform_strain_is_hookes(done):
     u = pad.mesh.nodes @ gradient.T
     strain = pad.strain(u)
     np.testing.assert_allclose(strain, np.tile([0.01, -0.02, 0.003], (len(strain), 1)), atol=1e-14)
-    lame_lambda, mu = lame_moduli(pad.E, pad.nu)
+    lame_lambda, mu = lame_moduli(pad.E.item(), pad.material.nu.item())
     stress = lame_lambda * np.trace(gradient) * np.eye(3)
     stress[:2, :2] += mu * (gradient + gradient.T)
     expected = [*np.diag(stress), stress[0, 1]]
@@ -97,7 +97,7 @@ def test_the_stress_under_a_contact_carries_its_force(done):
     nodes = pad.mesh.nodes[pad.mesh.elements]
     lowest = nodes[..., 1].min(1) == 0.0
     width = np.ptp(nodes[lowest][..., 0], axis=1)
-    carried = -float((stress[lowest, 1] * width).sum()) * pad.depth
+    carried = -float((stress[lowest, 1] * width).sum()) * pad.material.depth.item()
     assert carried == pytest.approx(-float(run.state.pads["L"][-1, 0, :, 1].sum()), rel=1e-3)
 
 

@@ -27,7 +27,7 @@ from torchsoft.rigs.build import ready
 from torchsoft.rigs.check import check
 from torchsoft.rigs.written import template, to_toml
 from torchsoft.solve.diagnostics import linearised, modes
-from torchsoft.solve.formats import load
+from torchsoft.solve.netcdf import load
 
 
 def coarse(file: RigFile, values: dict[str, Any] | None = None) -> RigFile:

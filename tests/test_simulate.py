@@ -28,7 +28,7 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.rigs.excite import Excitation
-from torchsoft.solve import stepper, system
+from torchsoft.solve import parameters, stepper
 from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.simulate import SharedStart
 
@@ -152,7 +152,7 @@ def test_a_run_has_the_parameters_that_it_started_with(monkeypatch, when):
         return other
 
     expected = result()
-    owner = stepper.ImplicitStepper if when == "integrate" else system
+    owner = stepper.ImplicitStepper if when == "integrate" else parameters
     monkeypatch.setattr(owner, when, changing(getattr(owner, when)))
     found = result()
     assert len(before) > 10

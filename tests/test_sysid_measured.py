@@ -21,7 +21,7 @@ from torchsoft.csvfile import UNITS
 from torchsoft.physics.channels import measurable
 from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
-from torchsoft.solve.formats import save
+from torchsoft.solve.netcdf import save
 from torchsoft.sysid import MovingStart
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.measured import STATED, cost, load, stem, vocabulary

@@ -29,7 +29,7 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
-from torchsoft.solve.trajectory import LIGHT
+from torchsoft.physics.channels import LIGHT
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 from torchsoft.testing import check_gradients
 

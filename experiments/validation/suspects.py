@@ -313,7 +313,7 @@ class Repetition(NamedTuple):
 
 
 FROZEN: dict[str, str] = json.loads(
-    (Path(__file__).parents[1] / "results" / "suspects_frozen.json").read_text()
+    (Path(__file__).parents[1] / "results" / "suspects_frozen.json").read_text(encoding="utf-8")
 )["outcomes"]
 """Outcomes before the search was rewritten: the true cause is "named", perhaps among others;
 something is "unconfirmed", "doubtful", or "none" of the suspects explains it; the model "holds"."""

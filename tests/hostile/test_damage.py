@@ -31,7 +31,7 @@ from torchsoft.datasets.check import check
 from torchsoft.datasets.files import StoreError
 from torchsoft.files import SEAL
 from torchsoft.rigs import RigFile
-from torchsoft.solve.formats import load
+from torchsoft.solve.netcdf import load
 from torchsoft.sysid import identify
 from torchsoft.sysid.columns import read_table
 from torchsoft.sysid.measured import vocabulary

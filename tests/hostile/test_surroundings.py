@@ -21,8 +21,8 @@ USER = 23456
 
 KEEP = """
 from torchsoft.solve.kernel import objects
-objects.keep("tiny", objects.level(), b"code")
-print(objects.found("tiny"))
+objects.keep(objects.level(), b"code")
+print(objects.found())
 """
 """Keeps a kernel of no content, since real ones take a minute to compile."""
 

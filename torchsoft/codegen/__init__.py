@@ -1,8 +1,8 @@
-"""Machine code of physical laws that are written as torch functions: value, Jacobian, and pullback
-to the parameters.
+"""Machine code of physical laws that are written as torch functions: value, Jacobian, and
+derivatives by the parameters along a direction (push) and of weighted outputs (pull).
 
 `compile_law` runs the function once, records its scalar expressions, differentiates them and
-compiles all three. `torchsoft.solve.kernel.invoke` calls the result from kernels.
+compiles all four. `torchsoft.solve.kernel.invoke` calls the result from kernels.
 """
 
 import itertools
@@ -24,9 +24,10 @@ class Law:
     """A compiled law; the addresses stay valid until the process ends, and mean nothing in another
     process.
 
-    value: void(x, p, out), linearise: void(x, p, out, J), pullback: void(x, p, w, p_bar), all
-    arguments double*: x (inputs,), p (parameters,), out (outputs,), J (linear, differentiated) by
-    rows, w (linear,), and p_bar (parameters,), to which Σ w[o]·∂out[o]/∂p[j] is added.
+    value: void(x, p, out), linearise: void(x, p, out, J), push: void(x, p, d, out_d), pull: void(x,
+    p, w, p_bar), all arguments double*: x (inputs,), p (parameters,), out (outputs,), J (linear,
+    differentiated) by rows, d (parameters,), out_d (linear,) = Σ d[j]·∂out[o]/∂p[j], w (linear,),
+    and p_bar (parameters,), to which Σ w[o]·∂out[o]/∂p[j] is added.
     """
 
     parameters: int
@@ -35,8 +36,8 @@ class Law:
     differentiated: int
     value: int
     linearise: int
-    pullback: int
-    push: int = 0
+    push: int
+    pull: int
 
 
 def compile_law(
@@ -83,11 +84,8 @@ def compile_law(
     differentiated = _count("differentiated", differentiated, x.numel())
     count = sum(tensor.numel() for tensor in parameters.values())
     functions = _functions(graph, outputs, linear, differentiated, count, lanes)
-    names = ["value", "linearise", "pullback"]
-    if conjugates is not None:
-        functions.append(_push(graph, outputs[:linear], count, lanes))
-        names.append("push")
     engine = emit.compiled(functions)
+    names = ("value", "linearise", "push", "pull")
     addresses = [engine.get_function_address(name) for name in names]
     return Law(count, len(outputs), linear, differentiated, *addresses)
 
@@ -105,7 +103,7 @@ def _forces(g: Graph, potentials: list[int], n: int) -> list[int]:
 def _functions(
     g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int, lanes: int
 ) -> list[str]:
-    """IR of the entry points that every law has."""
+    """IR of the entry points of a law."""
     x = [g.leaf("x", i) for i in range(differentiated)]
     J = itertools.chain.from_iterable(jacobian(g, outputs[:linear], x))
     p, p_bar = _pulled(g, outputs[:linear], parameters)
@@ -114,7 +112,8 @@ def _functions(
         emit.function(
             g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}, lanes=lanes
         ),
-        emit.function(g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p, p_bar)}, lanes),
+        _push(g, outputs[:linear], p, p_bar, lanes),
+        emit.function(g, "pull", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p, p_bar)}, lanes),
     ]
 
 
@@ -131,18 +130,13 @@ def _pulled(g: Graph, outputs: list[int], parameters: int) -> tuple[list[int], l
     return p + lookups, adjoints(g, seeds, {}, dependent(g, p + lookups), p + lookups)
 
 
-def _push(g: Graph, outputs: list[int], parameters: int, lanes: int) -> str:
-    """IR of the push: the pullback is linear in its weights, and its derivative by them transposed
-    is the push."""
-    p, p_bar = _pulled(g, outputs, parameters)
-    if len(p) > parameters:
-        raise UnknownOperation(
-            "The law looks up parameters by a value, which an energy cannot; write it with others."
-        )
+def _push(g: Graph, outputs: list[int], p: list[int], p_bar: list[int], lanes: int) -> str:
+    """IR of the push: the pull is linear in its weights, and its derivative by them transposed is
+    the push."""
     seeds: dict[int, int] = {}
-    for j, node in enumerate(p_bar):
-        direction = g.leaf("d", j)
-        seeds[node] = g("add", seeds[node], direction) if node in seeds else direction
+    for node, bar in zip(p, p_bar):
+        direction = g.direction(node)
+        seeds[bar] = g("add", seeds[bar], direction) if bar in seeds else direction
     w = [g.leaf("w", o) for o in range(len(outputs))]
     along = adjoints(g, seeds, {}, dependent(g, w), w)
     return emit.function(g, "push", ("x", "p", "d", "out"), {"out": along}, lanes=lanes)

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.codegen.graph import LEAVES, NAMED, Graph
+from torchsoft.codegen.graph import LEAVES, LOOKUPS, NAMED, Graph
 from torchsoft.codegen.operations import Nodes
 from torchsoft.codegen.trace import Trace, UnknownOperation, traced
 
@@ -179,8 +179,8 @@ class _Body:
     def called(self, node: int, name: str, operands: list[str]) -> Iterator[str]:
         """A function, or a look-up, of single numbers."""
         op = self.g.ops[node]
-        if op == "lookup":
-            yield from _address(self.g, node, "p", f"{name}.at", operands)
+        if op in LOOKUPS:
+            yield from _address(self.g, node, LOOKUPS[op], f"{name}.at", operands)
             yield f"{name} = load double, {POINTER} {name}.at"
         else:
             given = ", ".join("double " + a for a in operands)

@@ -9,6 +9,7 @@ import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 LEAVES = ("x", "p", "w", "d")  # inputs, parameters, output weights, a direction of parameters
+LOOKUPS = {"lookup": "p", "direction": "d"}  # of which leaves
 COMPARISONS = {
     "lt": operator.lt,
     "le": operator.le,
@@ -69,9 +70,14 @@ class Graph:
         return self._node(op, args, (op, *args), op in COMPARISONS or op in LOGIC, finite)
 
     def leaf(self, kind: str, index: int) -> int:
-        """Entry `index` of the inputs "x", the parameters "p", the output weights "w" of a pullback
+        """Entry `index` of the inputs "x", the parameters "p", the output weights "w" of a pull
         or a direction "d" of the parameters."""
         return self._node(kind, (index,), (kind, index), False, True)
+
+    def direction(self, node: int) -> int:
+        """The entry of a direction of the parameters that belongs to a parameter or a look-up."""
+        kind, args = {"p": "d", "lookup": "direction"}[self.ops[node]], self.args[node]
+        return self._node(kind, args, (kind, *args), False, True)
 
     def constant(self, value: float | bool) -> int:
         """A constant; a `bool` is a truth value, every other number a float64."""
@@ -85,7 +91,7 @@ class Graph:
     def operands(self, node: int) -> tuple[int, ...]:
         """The nodes whose values the instruction of `node` takes."""
         op, args = self.ops[node], self.args[node]
-        return () if op in (*LEAVES, "constant") else args[:1] if op in (*NAMED, "lookup") else args
+        return () if op in (*LEAVES, "constant") else args[:1] if op in (*NAMED, *LOOKUPS) else args
 
     def value(self, node: int) -> float | None:
         """The value of a constant node, and None for every other node."""

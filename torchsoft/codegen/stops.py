@@ -68,13 +68,13 @@ def evaluate(law: Law, x: Tensor, parameters: Mapping[str, Tensor], weights: Arr
     flat = [p.detach().reshape(-1) for p in parameters.values()]
     p = torch.cat([torch.zeros(0).double(), *flat]).numpy()
     kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)
-    linearise, pullback = kind(law.linearise), kind(law.pullback)
+    linearise, pull = kind(law.linearise), kind(law.pull)
     out = np.zeros((len(x), law.outputs))
     J = np.zeros((len(x), law.linear, law.differentiated))
     p_bar = np.zeros((len(x), law.parameters))
     for k, row in enumerate(x.detach().contiguous().numpy()):
         linearise(*(a.ctypes.data for a in (row, p, out[k], J[k])))
-        pullback(*(a.ctypes.data for a in (row, p, weights, p_bar[k])))
+        pull(*(a.ctypes.data for a in (row, p, weights, p_bar[k])))
     return Evaluated(out, J, p_bar)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchsoft.files import check_file
 from torchsoft.physics.channels import units
-from torchsoft.physics.energy import Integrals, stores
+from torchsoft.physics.energy import integrals, stores
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.places import Place
@@ -91,7 +91,7 @@ def differs(one: Rig, other: Rig) -> str | None:
             return f"the contact points of pads.{name}"
         if one.pads[name].state_shape != other.pads[name].state_shape:
             return f"the state of pads.{name}"
-    kinds = units, lambda rig: [*stores(rig)], lambda rig: Integrals(rig).active
+    kinds = units, lambda rig: [*stores(rig)], integrals
     for kind in (*kinds, lambda rig: rig.layout.free):
         if kind(one) != kind(other):
             return "the coordinates and energies of the rig"

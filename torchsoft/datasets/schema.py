@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchsoft.datasets.fields import Fields
 from torchsoft.datasets.rig_files import own_points, place
 from torchsoft.physics.channels import declared
-from torchsoft.physics.energy import Integrals, stores
+from torchsoft.physics.energy import names_of, stores
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
 from torchsoft.tables import line
@@ -126,11 +126,10 @@ def nodal(rig: Rig, series: Mapping[str, int], precision: str) -> Iterator[tuple
 
 def energies(rig: Rig) -> dict[str, tuple[str, tuple[str, ...]]]:
     """Dimension and parts of each kind of energy, by its name in a run."""
-    integrals = Integrals(rig)
     return {
         "stored": ("store", tuple(stores(rig))),
-        "dissipated": ("resistor", integrals.dissipated),
-        "supplied": ("source", integrals.active),
+        "dissipated": ("resistor", names_of(rig, "dissipated")),
+        "supplied": ("source", names_of(rig, "supplied")),
     }
 
 

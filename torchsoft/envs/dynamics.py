@@ -11,15 +11,15 @@ from torch import Tensor
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, positive, whole
-from torchsoft.physics.channels import MOMENT, Seen, declared, measurable
+from torchsoft.physics.channels import Seen, Touch, declared, measurable
 from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.rigs.built import BuiltRig
-from torchsoft.solve.gradients import TAPE_BYTES, attached
-from torchsoft.solve.simulate import RunOutcome, Task, prepare, run, started
+from torchsoft.solve.gradients import TAPE_BYTES, Solved, Task, attached
+from torchsoft.solve.simulate import prepare, run, started
 from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.steps import check_knots
-from torchsoft.solve.trajectory import Touch, Trajectory
+from torchsoft.solve.trajectory import Trajectory
 
 Ranges = Mapping[str, tuple[float, float]]
 """Lower and upper bound by name, in SI units."""
@@ -71,12 +71,12 @@ class Transition(NamedTuple):
     moment: Moment
     observation: Tensor
     reward: Tensor
-    outcome: RunOutcome
+    solved: Solved
 
     @property
     def knots(self) -> Tensor:
         """Times [s] of the steps, for a run with frozen steps."""
-        return torch.from_numpy(self.outcome.solved.out.knots)
+        return torch.from_numpy(self.solved.out.knots)
 
 
 class Dynamics:
@@ -131,21 +131,22 @@ class Dynamics:
 
     def _set_observed(self, ranges: Ranges) -> None:
         """Sort observed channels into entries of the state, sums of recorded forces, and others."""
-        rig, self._touch = self.rig, Touch(self.rig)
+        rig, touch = self.rig, Touch(self.rig)
         at = dict(zip(measurable(rig), rig.layout.rigid))
-        every = {one.name: one for one in declared(rig) if one.kind != MOMENT}
-        spread = {one: x for name, x in ranges.items() for one in self._touch.expanded([name])}
-        checked("observations", spread, [*every, *self._touch], "channels are")
+        every = {one.name: one for one in declared(rig) if one.forces is None}
+        spread = {one: x for name, x in ranges.items() for one in touch.expanded([name])}
+        checked("observations", spread, [*every, *touch], "channels are")
         self._origin, self._span = limits(spread)
         state = [name for name in spread if name in at]
-        felt = [name for name in spread if name in self._touch and self._touch[name].over is None]
+        plain = lambda name: touch.force_sums([name])[0].over is None
+        felt = [name for name in spread if name in touch and plain(name)]
         others = [name for name in spread if name not in (*state, *felt)]
-        self._other = {name: every.get(name) for name in others}
+        self._other = [every[name] if name in every else touch[name] for name in others]
         self._state = torch.tensor([at[name] for name in state], dtype=torch.int64)
-        start, places, weight = self._touch.sums(felt)
+        start, places, weight = touch.sums(felt)
         sums = sparse.csr_array((weight, places, start), (len(felt), places.max(initial=0) + 1))
         self._sums = torch.from_numpy(sums.toarray())
-        order = [*state, *felt, *self._other]
+        order = [*state, *felt, *others]
         self._order = torch.tensor([order.index(name) for name in spread], dtype=torch.int64)
 
     def _set_goal(self) -> None:
@@ -172,14 +173,15 @@ class Dynamics:
         parameters are read here, and their graph serves one backward pass. Raises
         `SimulationFailed`."""
         self._read, t = self._read_parameters(), torch.tensor([0.0, self.start or LOOK]).double()
-        own, rows = self.reference, attached([self._run(t, self._read.y0, None).solved])[0]
+        own = self.reference
+        y, recorded = attached([self._run(t, self._read.y0, None)])[0]
         there = -1 if self.start else 0
         with torch.no_grad():
             now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
         target = self.targets.mean(1) if target is None else target
         reached = (now - self._low) / self._half - 1
         none = torch.zeros(len(self.disturbances), 2, dtype=torch.float64)
-        return Moment(rows.y[there], reached, 0, target, none, rows.recorded[there])
+        return Moment(y[there], reached, 0, target, none, recorded[there])
 
     def _read_parameters(self) -> "Read":
         """What follows from the parameters of the rig as they are."""
@@ -190,7 +192,7 @@ class Dynamics:
                 **self.solver,
             ).stepper  # fmt: skip
         t, lines = torch.tensor([0.0, LOOK]).double(), torch.zeros(len(self._set_by), 2).double()
-        motion = stepper.compiled.followed(self._following(reference, t, lines), 0.0)
+        motion = stepper.parameters.followed(self._following(reference, t, lines), 0.0)
         return Read(y0, reference, stepper, motion)
 
     @property
@@ -224,14 +226,14 @@ class Dynamics:
         t = torch.linspace(begin, end, self.samples + 1, dtype=torch.float64)
         both = torch.stack((now.action, action))
         both = (self._low + self._half * (1 + both)).mT
-        outcome = self._run(t, now.y, torch.cat((both, self._disturbed(now))), knots)
-        rows = attached([outcome.solved])[0]
+        solved = self._run(t, now.y, torch.cat((both, self._disturbed(now))), knots)
+        rows = attached([solved])[0]
         moment = now._replace(
-            y=rows.y[-1], action=action, steps=now.steps + 1, recorded=rows.recorded[-1]
+            y=rows[0][-1], action=action, steps=now.steps + 1, recorded=rows[1][-1]
         )
         distance = self.distance(moment)
         if self.reward is not None:
-            given = self.reward(outcome.trajectory(rows), action)
+            given = self.reward(Trajectory.of(solved, rows), action)
             value = torch.as_tensor(given, dtype=torch.float64)
             if value.ndim or not bool(value.isfinite()):
                 raise ValueError(f"`reward` must give one finite number, but gives {given!r}")
@@ -240,8 +242,8 @@ class Dynamics:
             change = action - now.action
             value = (1 + distance.dot(distance)).reciprocal()
             value = value - self.goal.changes * change.dot(change)
-        seen = self._seen(moment, distance, outcome.solved.stepper)
-        return Transition(moment, seen, value, outcome)
+        seen = self._seen(moment, distance, solved.task.stepper)
+        return Transition(moment, seen, value, solved)
 
     def look(self, now: Moment) -> Trajectory:
         """A short run from a moment, whose first sample is that moment."""
@@ -249,7 +251,7 @@ class Dynamics:
         held = self._low + self._half * (1 + now.action)
         held = torch.cat((held, self._disturbed(now)[:, 0]))[:, None].expand(-1, 2)
         with torch.no_grad():
-            return self._run(t, now.y, held).trajectory()
+            return Trajectory.of(self._run(t, now.y, held))
 
     def distance(self, now: Moment) -> Tensor:
         """Distances of the goal's coordinates from their targets, over their scales."""
@@ -266,11 +268,8 @@ class Dynamics:
         if self._other:
             t = torch.tensor(self.start + now.steps * self.interval, dtype=torch.float64)
             signals = rig.follow(t, self.reference) if stepper is None else stepper.signals_now(t)
-            seen = Seen(rig, rig.unpack(y, signals), signals)
-            for name, own in self._other.items():
-                touch = own is None
-                x = self._touch[name].value(now.recorded[None])[0] if touch else own.read(seen)
-                parts.append(x[None])
+            seen = Seen(rig, rig.unpack(y, signals), signals, now.recorded)
+            parts += [own.read(seen)[None] for own in self._other]
         seen = (torch.cat(parts)[self._order] - self._origin) / self._span - 1
         return torch.cat((seen, distance, now.action))
 
@@ -308,7 +307,7 @@ class Dynamics:
 
     def _run(
         self, t: Tensor, y: Tensor, values: Tensor | None, knots: Tensor | None = None
-    ) -> RunOutcome:
+    ) -> Solved:
         """A run with lines between `values` (signals, 2) for signals set by actions or
         disturbances, or by the rig's own motion."""
         _, own, stepper, motion = self._known
@@ -322,8 +321,7 @@ class Dynamics:
         else:
             stepper = stepper.following(self._following(own, t[[0, -1]], values))
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
-        task = Task(stepper, t, y, "discrete", (), None, False, ())
-        return run(task, TAPE_BYTES, explained=False)
+        return run(Task(stepper, t, y), TAPE_BYTES, explained=False)
 
 
 class Read(NamedTuple):

@@ -25,6 +25,7 @@ from torchsoft.envs.dynamics import (
     checked,
 )
 from torchsoft.physics.arguments import number
+from torchsoft.physics.channels import recorded_slices
 from torchsoft.plot.scene import Instant, Scene, instants, limits
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
@@ -139,9 +140,10 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def _checked_held(self, held: Sequence[str]) -> dict[str, list[slice]]:
         """Recorded forces of the contacts of each body in `held`."""
         rig, slices = self.dynamics.rig, dict[str, list[slice]]()
-        ends = np.cumsum([0, *rig.point_counts.values()]) * 2
-        for contact, first, last in zip(rig.contacts.values(), ends, ends[1:]):
-            slices.setdefault(contact.body, []).append(slice(first, last, 2))
+        places = recorded_slices(rig)
+        for name, contact in rig.contacts.items():
+            here = places["contact", name]
+            slices.setdefault(contact.body, []).append(slice(here.start, here.stop, 2))
         names = [held] if isinstance(held, str) else held
         check_names("held", names, slices, "there are")
         return {body: slices[body] for body in names}

@@ -19,7 +19,7 @@ from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
 from torchsoft.materials.kinds import PULLS, PullTest, Test
 from torchsoft.physics.arguments import positive
-from torchsoft.physics.material import INSTANT
+from torchsoft.physics.material import INSTANT_TIME
 
 Array = NDArray[np.float64]
 
@@ -488,7 +488,7 @@ def hint(name: str, columns: int) -> str:
 
 def instant_time(tau: Sequence[float]) -> float:
     """Retardation time [s] of the instantaneous spring of a series of times tau [s]."""
-    return min(INSTANT, INSTANT_PART * min(tau))
+    return min(INSTANT_TIME, INSTANT_PART * min(tau))
 
 
 def faded(t: Array, x: Array, tau: Array) -> Array:

@@ -1,12 +1,13 @@
-"""Balance of the nodes of a pad with the forces on its surface: displacements at rest, or rates.
+"""Balance of a pad with the forces on its surface: displacements at rest, or rates.
 
-Newton's method with the banded matrix of the elements' and the contacts' derivatives; a last
-iteration with the gradient on makes the derivative that of the implicit function theorem.
+`newton` solves the equations of any pad: those of a condensed pad's contact points (`Points`), or
+of a nodal pad's nodes (`Nodes`). A last iteration with the gradient on, `corrected`, makes the
+derivative that of the implicit function theorem.
 """
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -14,11 +15,127 @@ from scipy.linalg.lapack import dgbtrf, dgbtrs  # pyright: ignore[reportAttribut
 from torch import Tensor
 
 from torchsoft.physics.mesh import Array
-from torchsoft.physics.pads import HALVINGS, Pad
+from torchsoft.physics.pads import Pad, under_forces
+
+HALVINGS = 12
+"""Halvings of a step of Newton's method at the most."""
 
 Forces = Callable[[Tensor], Tensor]
 """A function of displacements, or of rates: of corners (..., elements, 8) to forces on them, or of
 contact points (..., points, 2) to forces on these."""
+
+Solve = Callable[[Tensor], Tensor]
+"""Step of Newton's method (..., n, 2) for a residual (..., n, 2), differentiable in it."""
+
+
+class Equations(Protocol):
+    """Equations whose `residual` (..., n, 2) is to vanish at x (..., n, 2), and their linear
+    solution at x. Where residuals are of another kind than x, steps are judged in their place."""
+
+    like_x: bool
+
+    def residual(self, x: Tensor) -> Tensor: ...
+
+    def linearised(self, x: Tensor) -> Solve: ...
+
+
+@torch.no_grad()
+def newton(
+    equations: Equations, first: Tensor, tolerance: float, iterations: int
+) -> tuple[Tensor, Solve, float]:
+    """The solution from `first` (..., n, 2) on, the last linear solution, and the largest residual,
+    or step, that is left.
+
+    A step is halved, sample by sample, until the residual, or the step after it by the same linear
+    solution, is smaller. Raises `FloatingPointError` where a matrix is singular.
+    """
+    x, left = first.detach(), np.inf
+    r, solve = equations.residual(x), equations.linearised(x)
+    judged = (lambda r: r) if equations.like_x else (lambda r: solve(r))
+    for _ in range(iterations):
+        off = judged(r)
+        sizes = off.abs().amax((-2, -1))
+        left, going = float(sizes.max()), sizes > tolerance
+        if not bool(going.any()):
+            break
+        size, way = off.flatten(-2).norm(dim=-1), solve(r) * going[..., None, None]
+        for _ in range(HALVINGS):
+            r = equations.residual(x + way)
+            worse = going & ~(judged(r).flatten(-2).norm(dim=-1) < size)
+            if not bool(worse.any()):
+                break
+            way = way * torch.where(worse, 0.5, 1.0)[..., None, None]
+        x = x + way
+        solve = equations.linearised(x)
+    return x, solve, left
+
+
+def corrected(equations: Equations, x: Tensor, solve: Solve) -> Tensor:
+    """One iteration from the solution x (..., n, 2), which gives it its derivative."""
+    return x + solve(equations.residual(x))
+
+
+def slopes_at_points(law: Forces, x: Tensor) -> Tensor:
+    """Derivatives (..., points, 2, 2) of the forces on contact points at x (..., points, 2), of
+    which each depends on its own point only."""
+    with torch.enable_grad():
+        twice = torch.stack((x, x)).detach().requires_grad_()  # a copy for each component
+        f = law(twice)
+        total = (f[0, ..., 0] + f[1, ..., 1]).sum()
+        (rows,) = torch.autograd.grad(total, twice, materialize_grads=True)
+    return rows.movedim(0, -2)
+
+
+class Points:
+    """Contact points of a condensed pad at x = N (free + A N^T f(x)) (..., points, 2): A (2 nodes,
+    2 nodes) is its compliance or mobility, N (points, nodes) its shape functions, `free` (...,
+    nodes, 2) what its nodes do without forces, f a law of contact points."""
+
+    like_x = True
+
+    def __init__(self, A: Tensor, N: Tensor, free: Tensor, law: Forces) -> None:
+        self.A, self.N, self.free, self.law = A, N, free, law
+
+    def moved(self, f: Tensor) -> Tensor:
+        """Points under forces f (..., points, 2) on them."""
+        return self.N @ (self.free + under_forces(self.A, self.N.mT @ f))
+
+    def residual(self, x: Tensor) -> Tensor:
+        return self.moved(self.law(x)) - x
+
+    def linearised(self, x: Tensor) -> Solve:
+        """(1 - B G)^-1 with B = N A N^T and the slopes G of the law, of which only the points with
+        a slope are unknowns."""
+        N, A, G = self.N, self.A.detach(), slopes_at_points(self.law, x)
+        sloped = torch.nonzero(G.flatten(-2).any(-1).reshape(-1, len(N)).any(0))[:, 0]
+        if not len(sloped):
+            return lambda r: r
+        G, own = G[..., sloped, :, :], N[sloped]
+        components = torch.kron(own, torch.eye(2, dtype=N.dtype))
+        B = (components @ A @ components.mT).unflatten(-1, (-1, 2))
+        J = torch.eye(len(components), dtype=x.dtype)
+        J = J - torch.einsum("rpj,...pjk->...rpk", B, G).flatten(-2)
+
+        def solve(r: Tensor) -> Tensor:
+            step = torch.linalg.solve(J, r[..., sloped, :].flatten(-2)[..., None])
+            force = (G @ step.unflatten(-2, (-1, 2)))[..., 0]
+            return r + N @ under_forces(A, own.mT @ force)
+
+        return solve
+
+
+def contact_forces(
+    A: Tensor, N: Tensor, free: Tensor, law: Forces, tolerance: float, iterations: int,
+    first: Tensor | None = None,
+) -> tuple[Tensor, float]:  # fmt: skip
+    """Forces N^T f (..., nodes, 2) [N] of a law at the contact points of a condensed pad (see
+    `Points`), and the largest residual that is left, from the forces `first` (..., points, 2) on,
+    none by default."""
+    points = Points(A, N, free, law)
+    x, solve, left = newton(
+        points, N @ free if first is None else points.moved(first), tolerance, iterations
+    )
+    return N.mT @ law(corrected(points, x, solve)), left
 
 
 class Banded:
@@ -42,8 +159,8 @@ class Banded:
         """The factorised derivative of the residual, internal less contact forces, of those of the
         elements' forces (elements, 8, 8) and of the points' (points, 2, 2)."""
         A = np.zeros((3 * self.band + 1, self.size), order="F")
-        spread = self.shares[:, :, :, None, None] * contacts[:, None, None]
-        values = np.concatenate((elements[self.kept], -spread.ravel()))
+        on_nodes = self.shares[:, :, :, None, None] * contacts[:, None, None]
+        values = np.concatenate((elements[self.kept], -on_nodes.ravel()))
         np.add.at(A, (2 * self.band + self.row - self.column, self.column), values)
         return Factor(A, self.band)
 
@@ -92,9 +209,11 @@ def solved(b: Tensor, factors: list[Factor], transposed: bool = False) -> Tensor
     return torch.from_numpy(np.stack(rows))
 
 
-class Balance:
-    """Nodes (..., nodes, 2) of a pad in balance, of the elements' forces `internal` and of those of
-    a law of contact points, none by default."""
+class Nodes:
+    """Nodes (..., nodes, 2) of a nodal pad in balance, of the elements' forces `internal` and of
+    those of a law of contact points, none by default."""
+
+    like_x = False
 
     def __init__(self, pad: Pad, internal: Forces, law: Forces | None = None) -> None:
         self.pad, self.internal, self.law = pad, internal, law
@@ -109,56 +228,28 @@ class Balance:
         left = -pad.from_corners(self.internal(pad.at_corners(x)))
         return left if self.law is None else left + pad.spread.mT @ self.law(pad.spread @ x)
 
-    def linearised(self, x: Tensor) -> list[Factor]:
-        """Factors of the derivative of internal less contact forces, sample by sample."""
+    def linearised(self, x: Tensor) -> Solve:
+        """By factors of the derivative of internal less contact forces, sample by sample."""
         pad = self.pad
         with torch.enable_grad():
             at = pad.at_corners(x).expand(8, *x.shape[:-2], -1, -1).clone().requires_grad_()
             each = self.internal(at).movedim(-1, 0).diagonal(0, 0, 1)  # a copy for each component
             (rows,) = torch.autograd.grad(each.sum(), at)
-            elements = rows.movedim(0, -2).reshape(-1, *pad.corners.shape, 8)
-            contacts = torch.zeros(len(elements), len(pad.spread), 2, 2, dtype=x.dtype)
-            if self.law is not None:
-                twice = torch.stack((pad.spread @ x,) * 2).requires_grad_()
-                f = self.law(twice)
-                total = (f[0, ..., 0] + f[1, ..., 1]).sum()
-                (G,) = torch.autograd.grad(total, twice, materialize_grads=True)
-                contacts = G.movedim(0, -2).reshape(contacts.shape)
+        elements = rows.movedim(0, -2).reshape(-1, *pad.corners.shape, 8)
+        contacts = torch.zeros(len(elements), len(pad.spread), 2, 2, dtype=x.dtype)
+        if self.law is not None:
+            contacts = slopes_at_points(self.law, pad.spread @ x).reshape(contacts.shape)
         pairs = zip(elements.numpy(), contacts.numpy())
-        return [self.banded.factor(*pair) for pair in pairs]
+        return self.by_factors([self.banded.factor(*pair) for pair in pairs])
 
-    @torch.no_grad()
-    def found(
-        self, first: Tensor, tolerance: float, iterations: int
-    ) -> tuple[Tensor, list[Factor], float]:
-        """The nodes from `first` (..., nodes, 2) on, the factors of the last iteration, and its
-        largest step.
+    @staticmethod
+    def by_factors(factors: list[Factor]) -> Solve:
+        """Steps with a factor for every sample, or one for all."""
 
-        Raises `FloatingPointError` where the matrix is singular.
-        """
-        x, factors, left = first.detach(), list[Factor](), np.inf
-        r = self.residual(x)
-        for _ in range(iterations):
-            factors = self.linearised(x)
-            step = solved(r.reshape(len(factors), -1), factors).reshape(r.shape)
-            sizes = step.abs().amax((-2, -1))
-            left, going = float(sizes.max()), sizes > tolerance
-            if not bool(going.any()):
-                break
-            size, way = step.flatten(-2).norm(dim=-1), step * going[..., None, None]
-            for _ in range(HALVINGS):  # until the step after it, with the same matrix, is shorter
-                r = self.residual(x + way)
-                after = solved(r.reshape(len(factors), -1), factors)
-                worse = going & ~(after.norm(dim=-1).reshape(size.shape) < size)
-                if not bool(worse.any()):
-                    break
-                way = way * torch.where(worse, 0.5, 1.0)[..., None, None]
-            x = x + way
-        return x, factors, left
+        def solve(r: Tensor) -> Tensor:
+            rows = r.reshape(-1, r.shape[-2] * r.shape[-1])
+            own = factors * (len(rows) // len(factors))
+            step: Any = _Solved.apply(rows, own, False)
+            return step.reshape(r.shape)
 
-    def corrected(self, x: Tensor, factors: list[Factor]) -> Tensor:
-        """One iteration from the nodes x (..., nodes, 2) in balance, which gives them their
-        derivative; `factors` sample by sample."""
-        r = self.residual(x)
-        step: Any = _Solved.apply(r.reshape(len(factors), -1), factors, False)
-        return x + step.reshape(r.shape)
+        return solve

@@ -291,7 +291,7 @@ ADHERING_DEPTH = 1e-6
 """Penetration [m] at which half of the adhesion acts, which sets in smoothly."""
 
 
-INSTANT = 1e-12
+ONE_MOMENT = 1e-12
 """Length of a stage [s] up to which it is one moment of a step."""
 
 FADING = 1e-2
@@ -455,7 +455,9 @@ class SoftContact(LawPart):
         if z is None or not ages(self.friction):
             return slip_of(self.friction, E, F_N, R, z, stage)
         age, stage = z[..., 0], stage + 0.0 * E
-        age = torch.where(stage <= INSTANT, age.clamp(min=0.0), age)  # interpolation may overshoot
+        age = torch.where(
+            stage <= ONE_MOMENT, age.clamp(min=0.0), age
+        )  # interpolation may overshoot
         new, since = touched_down(g, g_dot, age, stage)
         lived, first = 1 + new * (since - 1), age * (1 - new)
         slip, z_dot = self.friction(E, F_N, R, first[..., None], stage * lived)
@@ -568,7 +570,7 @@ def free_law(contact: SoftContact, x: Tensor) -> Tensor:
     """Rates of the states, powers of dashpots and of slip (..., states + 2) away from contact, of x
     = (states at the stage's start, weight, a h)."""
     s, z, weight, stage = x[..., 0], x[..., 1:-2], x[..., -2], x[..., -1]
-    apart, still = torch.full_like(s, -1.0), torch.zeros_like(s)
-    at = contact(apart, still, still, s, weight, stage, z)
-    powers = torch.stack(contact.dissipated(at, apart, still, weight), -1)
+    outside, rest = torch.full_like(s, -1.0), torch.zeros_like(s)
+    at = contact(outside, rest, rest, s, weight, stage, z)
+    powers = torch.stack(contact.dissipated(at, outside, rest, weight), -1)
     return torch.cat((at.s_dot[..., None], *state_rates(at), powers), -1)

@@ -39,11 +39,15 @@ GAUSS = [(a / np.sqrt(3), b / np.sqrt(3)) for a in (-1, 1) for b in (-1, 1)]
 WITHIN = 1 / 3
 """Modulus against changes of volume within an element, over the shear modulus of small strains."""
 
-CORNERS = 8
-"""Displacements of an element in one field."""
 
-CONSTANTS = 9 * (1 + len(GAUSS))
-"""Number of an element's constants."""
+class Quadrilateral:
+    """Numbers of the element: its nodes, their displacements in one field, and its constants at one
+    place and in all."""
+
+    nodes = 4
+    dofs = 2 * nodes
+    at_place = dofs + 1
+    constants = at_place * (1 + len(GAUSS))
 
 
 def element_constants(corners: Array) -> Array:
@@ -53,8 +57,8 @@ def element_constants(corners: Array) -> Array:
     parts = []
     for xi, zeta in [(0.0, 0.0), *GAUSS]:
         _, gradient, determinant = gradients(corners, xi, zeta)
-        share = 4.0 if not parts else 1.0
-        parts += [gradient.reshape(-1, 8), share * abs(determinant)[:, None]]
+        share = float(len(GAUSS)) if not parts else 1.0
+        parts += [gradient.reshape(-1, Quadrilateral.dofs), share * abs(determinant)[:, None]]
     return np.concatenate(parts, 1)
 
 
@@ -73,15 +77,16 @@ Places = tuple[Place, Place]
 
 def places(x: Tensor) -> list[Places]:
     """Places of an element with the gradients of u, and with those of every v_b."""
-    constants = x[..., -CONSTANTS:].unflatten(-1, (1 + len(GAUSS), 9))
-    gx, gy, area = constants[..., 0:8:2], constants[..., 1:8:2], constants[..., 8]
+    own = Quadrilateral
+    constants = x[..., -own.constants :].unflatten(-1, (1 + len(GAUSS), own.at_place))
+    gx, gy, area = constants[..., :-1:2], constants[..., 1:-1:2], constants[..., -1]
 
     def gradient(of: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         ux, uy = of[..., None, 0::2], of[..., None, 1::2]
         xx, xy = (gx * ux).sum(-1), (gy * ux).sum(-1)
         return xx, xy, (gx * uy).sum(-1), (gy * uy).sum(-1)
 
-    moved = x[..., :-CONSTANTS].unflatten(-1, (2, -1, CORNERS))
+    moved = x[..., : -own.constants].unflatten(-1, (2, -1, own.dofs))
     fields = []
     for u, rate in zip(moved[..., 0, :, :].unbind(-2), moved[..., 1, :, :].unbind(-2)):
         of_u, of_rate = gradient(u), gradient(rate)
@@ -141,12 +146,12 @@ def finite_energy(
     material: Hyperelastic, shear: Tensor, centre: Place, gauss: Place, flown: Places | None = None
 ) -> Tensor:
     """Energy per depth at finite strain, of a branch that has `flown` if given."""
-    (J_0, _), (J, _), felt = volume(centre), volume(gauss), gauss.gradient
+    (J_0, _), (J, _), elastic = volume(centre), volume(gauss), gauss.gradient
     if flown is not None:
         (J_0_b, _), (J_b, _) = map(volume, flown)
         J_0, J = 1 + (J_0 - J_0_b), 1 + (J - J_b)
-        felt = over([one - other for one, other in zip(felt, flown[1].gradient)], flown[1])
-    xx, xy, yx, yy = felt
+        elastic = over([one - other for one, other in zip(elastic, flown[1].gradient)], flown[1])
+    xx, xy, yx, yy = elastic
     zero, one = torch.zeros_like(J), torch.ones_like(J)
     rows = (1 + xx, xy, zero), (yx, 1 + yy, zero), (zero, zero, one)
     W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))

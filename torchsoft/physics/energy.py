@@ -1,12 +1,14 @@
-"""Energies of a rig: those stored in its C and I fields, element by element, at given states.
+"""Energies of a rig: what its C and I fields store, R elements dissipate and sources supply, each
+declared once, with its name.
 
-Dissipated and supplied energies are integrated beside the state by the stepper, from the same laws;
-`powers` reads them off the ports of the multibond graph, so that the balance at one instant can be
-checked without any stepper.
+Stored energies are functions of a state. The others are integrated beside it by the stepper, from
+the same laws; `dissipated` and `supplied` read the powers off the ports of the multibond graph, so
+that the balance at one instant can be checked without any stepper.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import partial
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,84 +20,98 @@ from torchsoft.physics.contact import (
     point_place,
 )
 from torchsoft.physics.graph import Evaluation, Graph
-from torchsoft.physics.pads import free_rates, nodal
+from torchsoft.physics.pads import free_rates, under_forces
 from torchsoft.physics.state import State
 
-Store = Callable[["AtState"], Tensor]
+Displacements = Mapping[str, Tensor]
+"""Displacements of pads (..., nodes, 2) [m], where they are known already."""
+
+Store = Callable[[Graph, State, Displacements], Tensor]
 """Function of a rig's state to an energy (...) [J]."""
 
 
-class AtState:
-    """A rig in some states (...), with the displacements of its pads, where they are known already,
-    and the energies [J] of its contacts' springs, normal and tangential."""
+def strain_energy(rig: Graph, state: State, known: Displacements, pad: str) -> Tensor:
+    return rig.pads[pad].strain_energy(state.pads[pad], known.get(pad))
 
-    def __init__(self, rig: Graph, state: State, displacement: Mapping[str, Tensor]) -> None:
-        self.rig, self.state, self.displacement = rig, state, displacement
 
-    @cached_property
-    def springs(self) -> tuple[Tensor, Tensor]:
-        rig, zero = self.rig, torch.zeros_like(next(iter(self.state.pose.values()))[..., 0])
-        normal, tangential = zero, zero
-        for name, contact in rig.contacts.items():
-            depth = rig.penetration(name, self.state, self.displacement.get(contact.pad))
-            parts = contact.law.stored(depth, self.state.stretch[name], rig.weight(name))
-            normal, tangential = normal + parts[0].sum(-1), tangential + parts[1].sum(-1)
-        return normal, tangential
+def spring_energy(rig: Graph, state: State, known: Displacements, kind: int) -> Tensor:
+    """Energy of the normal springs of all contacts, kind 0, or of the tangential ones, 1."""
+    total = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
+    for name, contact in rig.contacts.items():
+        depth = rig.penetration(name, state, known.get(contact.pad))
+        own = contact.law.stored(depth, state.stretch[name], rig.weight(name))
+        total = total + own[kind].sum(-1)
+    return total
+
+
+def kinetic_energy(
+    rig: Graph, state: State, known: Displacements, body: str, axes: Sequence[int]
+) -> Tensor:
+    masses, velocity = rig.bodies[body].masses, state.velocity[body]
+    return sum((0.5 * masses[i] * velocity[..., i] ** 2 for i in axes), velocity.new_zeros(()))
+
+
+def inertial_energy(rig: Graph, state: State, known: Displacements, pad: str) -> Tensor:
+    return 0.5 * (rig.pads[pad].masses()[:, None] * state.rates[pad] ** 2).sum((-2, -1))
 
 
 def stores(rig: Graph) -> dict[str, Store]:
     """Energies that are stored, by name: strain of every pad, contact springs, kinetic energies of
     bodies and pads that move freely."""
-
-    def strain(at: AtState, name: str) -> Tensor:
-        known = at.displacement.get(name)
-        return at.rig.pads[name].strain_energy(at.state.pads[name], known)
-
-    def kinetic(at: AtState, name: str, axes: Sequence[int]) -> Tensor:
-        masses, velocity = at.rig.bodies[name].masses, at.state.velocity[name]
-        return sum((0.5 * masses[i] * velocity[..., i] ** 2 for i in axes), velocity.new_zeros(()))
-
-    def inertial(at: AtState, name: str) -> Tensor:
-        masses, rates = at.rig.pads[name].masses(), at.state.rates[name]
-        return 0.5 * (masses[:, None] * rates**2).sum((-2, -1))
-
-    out: dict[str, Store] = {f"strain_{name}": partial(strain, name=name) for name in rig.pads}
-    out["normal_springs"] = lambda at: at.springs[0]
-    out["tangential_springs"] = lambda at: at.springs[1]
+    out: dict[str, Store] = {
+        f"strain_{name}": partial(strain_energy, pad=name) for name in rig.pads
+    }
+    out["normal_springs"] = partial(spring_energy, kind=0)
+    out["tangential_springs"] = partial(spring_energy, kind=1)
     for name, axes in rig.layout.free.items():
         for key, own in ((name, [i for i in axes if i < 2]), (f"{name}_spin", [2] * (2 in axes))):
             if own:
-                out[key] = partial(kinetic, name=name, axes=own)
+                out[key] = partial(kinetic_energy, body=name, axes=own)
     for name, pad in rig.pads.items():
         if pad.inertial:
-            out[f"kinetic_{name}"] = partial(inertial, name=name)
+            out[f"kinetic_{name}"] = partial(inertial_energy, pad=name)
     return out
 
 
-def stored(
-    rig: Graph, state: State, displacement: Mapping[str, Tensor] | None = None
-) -> dict[str, Tensor]:
-    """Stored energies (...) [J]; `displacement` are those of the pads, where they are known
-    already."""
-    at = AtState(rig, state, displacement or {})
-    return {name: energy(at) for name, energy in stores(rig).items()}
+def stored(rig: Graph, state: State, known: Displacements | None = None) -> dict[str, Tensor]:
+    """Stored energies (...) [J]."""
+    return {name: energy(rig, state, known or {}) for name, energy in stores(rig).items()}
 
 
-class Integrals:
-    """Names of the running integrals [J]: energies dissipated and supplied by element, those
-    supplied that there are in the rig, and the positive part of the sources' work."""
+class Integral(NamedTuple):
+    """An energy [J] that the kernels integrate: "dissipated" or "supplied", its name, its number
+    among theirs, and the factor by which theirs counts."""
 
-    def __init__(self, rig: Graph) -> None:
-        self.dissipated = (*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip")
-        drives = {f"drive_{k}": "driven" in body.freedom.values() for k, body in rig.bodies.items()}
-        self.supplied = (*(f"control_{name}" for name in rig.actuators), "gravity", *drives)
-        self.names = (*self.dissipated, *self.supplied, "injected")
-        self.active = tuple(name for name in self.supplied if drives.get(name, True))
+    kind: Literal["dissipated", "supplied"]
+    name: str
+    number: int
+    factor: float = 1.0
+
+
+def integrals(rig: Graph) -> list[Integral]:
+    """The energies that are dissipated and supplied, in the kernels' order: by pads, by dashpots
+    and slip of all contacts, by actuators, by gravity and by the drives of all bodies; last comes
+    the positive part of the sources' work. The kernels count what an actuator supplies."""
+    names = [*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip"]
+    out = [Integral("dissipated", name, i) for i, name in enumerate(names)]
+    for name, actuator in rig.actuators.items():
+        kind, factor = ("dissipated", -1.0) if actuator.resists else ("supplied", 1.0)
+        out.append(Integral(kind, f"control_{name}", len(out), factor))
+    out.append(Integral("supplied", "gravity", len(out)))
+    for i, (name, body) in enumerate(rig.bodies.items(), out[-1].number + 1):
+        if "driven" in body.freedom.values():
+            out.append(Integral("supplied", f"drive_{name}", i))
+    return sorted(out, key=lambda one: one.kind)
+
+
+def names_of(rig: Graph, kind: Literal["dissipated", "supplied"]) -> tuple[str, ...]:
+    """Names of the energies of one kind."""
+    return tuple(one.name for one in integrals(rig) if one.kind == kind)
 
 
 def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]:
     """Powers [W] that the R elements take out, each shaped like the batch and never negative."""
-    powers, dashpots, slip = {}, 0.0, 0.0
+    powers, dashpots, slip = dict[str, Tensor](), 0.0, 0.0
     for name, pad in rig.pads.items():
         port = graph.ports[f"pad_{name}"]
         rates = graph.pad_rates(name) if pad.nodal else port.effort
@@ -105,7 +121,9 @@ def dissipated(rig: Graph, state: State, graph: Evaluation) -> dict[str, Tensor]
             dashpots + interface.law.dashpots.sum(-1),
             slip + interface.law.slip.sum(-1),
         )
-    return powers | {"contact_dashpots": torch.as_tensor(dashpots), "slip": torch.as_tensor(slip)}
+    powers |= {"contact_dashpots": torch.as_tensor(dashpots), "slip": torch.as_tensor(slip)}
+    resisting = (f"control_{name}" for name, one in rig.actuators.items() if one.resists)
+    return powers | {name: graph.ports[name].power(graph.flows) for name in resisting}
 
 
 def supplied(graph: Evaluation) -> dict[str, Tensor]:
@@ -138,8 +156,8 @@ def contact_states(
         rate = rates[name][..., :2] if pad.nodal else _rates(rig, name, touched, state, u, force)
         for key, which in touched.items():
             law, shape = rig.contacts[key].law, rig.shape_of(key)
-            spread = pad.spread[which]
-            x = rig.point_inputs(key, state, spread @ u, spread @ rate, which)
+            shares = pad.spread[which]
+            x = rig.point_inputs(key, state, shares @ u, shares @ rate, which)
             slips = torch.zeros(force[key].shape[:-1], dtype=torch.int8)
             slips[..., which] = (PointLaw.of(interface_law(law, shape, x)).slip > 0).to(torch.int8)
             out[key] = (force[key][..., 0] > 0).to(torch.int8) * (STICKING + slips)
@@ -154,11 +172,11 @@ def _rates(
     pad = rig.pads[name]
     f = torch.zeros_like(u)
     for key, which in touched.items():
-        spread = pad.spread[which]
-        at = spread @ u
+        shares = pad.spread[which]
+        at = shares @ u
         x = rig.point_inputs(key, state, at, torch.zeros_like(at), which)
         frame = moving_frame(rig.shape_of(key), *point_place(x))
         F_N, F_T = force[key][..., which, :].split(1, -1)
-        f = f + spread.mT @ (F_N * frame.n + F_T * frame.t)
+        f = f + shares.mT @ (F_N * frame.n + F_T * frame.t)
     free, P = free_rates(pad, state.pads[name], 0.0)
-    return free + nodal(P, f)
+    return free + under_forces(P, f)

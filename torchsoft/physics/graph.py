@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from torchsoft.display import suggestion
-from torchsoft.physics.balance import Balance, Forces
+from torchsoft.physics.balance import Forces, Nodes, contact_forces, corrected, newton
 from torchsoft.physics.contact import (
     Frame,
     PointLaw,
@@ -24,11 +24,11 @@ from torchsoft.physics.contact import (
     relative_motion,
     turned,
 )
-from torchsoft.physics.elements import CORNERS
+from torchsoft.physics.elements import Quadrilateral
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import check_names
-from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, nodal, nodal_forces
+from torchsoft.physics.pads import Pad, Taxels, check_taxels, free_rates, under_forces
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, weight
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import (
@@ -297,7 +297,7 @@ class Graph(nn.Module):
         if pad.nodal:
             return part if pad.fields == 1 else part[..., :2]
         fractions, _ = pad.chain()
-        return nodal(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
+        return under_forces(pad.compliance(), (fractions[:, None, None] * part).sum(-3))
 
     def penetration(self, name: str, state: State, u: Tensor | None = None) -> Tensor:
         """Depth of the points of a contact in the body [m], (..., points); negative where they are
@@ -502,9 +502,9 @@ class Graph(nn.Module):
             return free
         with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
             first = law(torch.zeros_like(pad.spread @ free))
-        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
+        F, left = contact_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
         self._check_rates(name, left)
-        return free + nodal(P, F)
+        return free + under_forces(P, F)
 
     def _branch_rates(self, name: str, state: State) -> Tensor:
         """Rates (..., nodes, 2 branches) [m/s] of the relaxing branches of a nodal pad."""
@@ -518,19 +518,19 @@ class Graph(nn.Module):
         under the forces of a law of contact points, or of a branch. No dashpot is between two of
         them."""
         pad, part = self.pads[name], state.pads[name]
-        at, own = pad.at_corners(part), slice(CORNERS * field, CORNERS * (field + 1))
+        at, dofs = pad.at_corners(part), Quadrilateral.dofs
+        own = slice(dofs * field, dofs * (field + 1))
         others = own.start, at.shape[-1] - own.stop
         internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., own]
-        balance = Balance(pad, internal, law)
-        none = torch.zeros_like(part[..., :2])
+        nodes, none = Nodes(pad, internal, law), torch.zeros_like(part[..., :2])
         try:
-            rate, factors, left = balance.found(none, RATE_TOLERANCE, RATE_ITERATIONS)
+            rate, solve, left = newton(nodes, none, RATE_TOLERANCE, RATE_ITERATIONS)
         except FloatingPointError:
             raise NoRates(
                 f"the massless pad `{name}` has no rates in this state; is an element inside out?"
             ) from None
         self._check_rates(name, left)
-        return balance.corrected(rate, factors)
+        return corrected(nodes, rate, solve)
 
     def _check_rates(self, name: str, left: float) -> None:
         """Raises `NoRates` for rates of a massless pad with a residual [m/s]."""
@@ -589,7 +589,7 @@ class Graph(nn.Module):
         return Port(Transformer(blocks), effort, pad.elements(name))
 
     def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:
-        """Weights and actuators."""
+        """Weights and actuators, which are sources unless they resist."""
         out = {}
         for name, body in self.weighted.items():
             force = weight(body.mass, self.gravity).expand(signals.shape[:-2])
@@ -603,17 +603,15 @@ class Graph(nn.Module):
             sensed = dict.fromkeys(
                 f"{one}_spin" if of == "theta" else one for one, _, of in measured
             )
-            force = self.actuator_effort(name, state, signals)
-            spin = axis == "theta"
-            own = f"{body}_spin" if spin else body
-            row = (
-                torch.ones(1, 1, 1, dtype=torch.float64)
-                if spin
-                else torch.eye(2, dtype=torch.float64)[None, COORDINATES.index(axis), None]
-            )
+            force = self.actuator_effort(name, state, signals)[..., None, None]
+            eye = torch.eye(3, dtype=torch.float64)[None, COORDINATES.index(axis), None]
+            own, row = (f"{body}_spin", eye[..., 2:]) if axis == "theta" else (body, eye[..., :2])
+            blocks, senses = {own: Block(row)}, tuple(one for one in sensed if one != own)
+            if actuator.resists:  # what the coordinate does to the ground, which does not turn
+                blocks[GROUND] = Block(-eye[..., :2])
             out[f"control_{name}"] = Port(
-                Transformer({own: Block(row)}), force[..., None, None], actuator.elements, True,
-                senses=tuple(one for one in sensed if one != own),
+                Transformer(blocks), -force if actuator.resists else force, actuator.elements,
+                not actuator.resists, senses,
             )  # fmt: skip
         return out
 

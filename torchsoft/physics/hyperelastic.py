@@ -24,6 +24,7 @@ from torchsoft.physics.material import (
     KelvinVoigt,
     Material,
     OneTime,
+    Series,
     creeping,
     numbered,
     pairs,
@@ -392,9 +393,11 @@ def described(material: Material) -> dict[str, Any] | None:
     kind = next((name for name, own in KINDS.items() if type(material) is own), None)
     if kind is None:
         return None
-    numbers, lists = dict[str, Any](), dict[tuple[str, str], Any]()
+    numbers, lists = dict[str, Any](), dict[tuple[str, ...], Any]()
     if isinstance(material, Ogden):
         lists["mu", "alpha"] = material.series()
+    if isinstance(material, Series):
+        lists[tuple(material.lists.values())] = pairs(material, material.terms, *material.lists)
     if isinstance(material, Hyperelastic):
         lists["moduli", "times"] = pairs(material, material.relaxing, *material.lists)
     for names, rows in lists.items():

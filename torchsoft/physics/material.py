@@ -17,7 +17,7 @@ from torchsoft.physics.arguments import number
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Density, Depth, Modulus, PoissonRatio, Quantity, Retardation
 
-INSTANT = 1e-4
+INSTANT_TIME = 1e-4
 """Retardation time [s] of an instantaneous spring, where none is given: small, not zero, so that
 the rates are functions of the state."""
 
@@ -141,7 +141,7 @@ class StandardLinearSolid(Material):
     def __init__(
         self, E: Modulus, E_instant: Annotated[Modulus, "Young's modulus at first, above E"],
         nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth,
-        tau_instant: InstantRetardation = INSTANT,
+        tau_instant: InstantRetardation = INSTANT_TIME,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
         self.E_instant = parameter(E_instant, "E_instant")
@@ -204,7 +204,7 @@ class GeneralisedKelvin(Series):
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, J: Fractions,
-        tau: Retardations, tau_instant: InstantRetardation = INSTANT,
+        tau: Retardations, tau_instant: InstantRetardation = INSTANT_TIME,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth, J, tau, tau_instant)
 
@@ -234,7 +234,7 @@ class Prony(Series):
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, moduli: Moduli,
-        tau: Retardations, tau_instant: InstantRetardation = INSTANT,
+        tau: Retardations, tau_instant: InstantRetardation = INSTANT_TIME,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth, moduli, tau, tau_instant)
 

@@ -452,13 +452,16 @@ class Reference(nn.Module):
             raise ValueError(f"the signal `{name}` of the reference is none any more: {wrong}")
         return signal
 
+    def is_plain(self, names: Sequence[str]) -> bool:
+        """Whether these signals are polynomials of this package's, and nothing else decides their
+        values."""
+        return not self.own_way and all(polynomial(self[name]) for name in names)
+
     def plain(self, names: Sequence[str]) -> list[Piecewise] | None:
-        """These signals, if all of them are polynomials of this package's and nothing else decides
-        their values; else None. Raises `ValueError` for knots that are none."""
+        """These signals, if they are plain; else None. Raises `ValueError` for knots that are
+        none."""
         chosen = [self._now(name) for name in names]
-        if self.own_way or not all(map(polynomial, chosen)):
-            return None
-        return chosen  # pyright: ignore[reportReturnType]
+        return chosen if self.is_plain(names) else None  # pyright: ignore[reportReturnType]
 
     @property
     def own_way(self) -> bool:

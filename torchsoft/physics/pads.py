@@ -6,13 +6,14 @@ branch of its material's chain. A nodal pad, at finite strain or inertial, has t
 its nodes, beside them those of its relaxing branches, and with inertia the nodes' velocities.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, lru_cache
 from typing import Annotated, Any
 
 import numpy as np
 import torch
+from scipy.sparse.linalg import SuperLU, splu
 from scipy.special import ndtr
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -24,15 +25,17 @@ from torchsoft.physics.elements import (
     element_energy,
     element_potential,
 )
-from torchsoft.physics.hyperelastic import Hyperelastic
+from torchsoft.physics.hyperelastic import Hyperelastic, again, described, plane
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import (
     Array,
     Index,
     Mesh,
+    dofs_of,
     lame_moduli,
     unit_compliance,
 )
+from torchsoft.physics.mesh.mesh import gradients
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import StateBlock
 from torchsoft.quantity import Length, Quantity, Ratio, check_declared, quantities
@@ -91,6 +94,7 @@ class Pad(nn.Module):
         )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
         kept = np.arange(len(mesh.free)) if self.nodal else mesh.surface
+        self.angle, self.mirrored = float(angle), bool(mirrored)
         c, s = np.cos(angle), np.sin(angle)
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
         self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
@@ -129,14 +133,38 @@ class Pad(nn.Module):
         self, mesh: Mesh, material: Material, inertial: bool, points: int,
         origin: Array | None = None, turn: float = 0.0,
     ) -> "Pad":  # fmt: skip
-        (c, s), at = self.axes[:, 0].tolist(), self.origin.numpy() if origin is None else origin
+        x, y = self.origin.tolist() if origin is None else origin
         pad = Pad(
-            mesh, material, base=self.base, origin=(float(at[0]), float(at[1])),
-            angle=float(np.arctan2(s, c)) + turn, mirrored=float(self.axes.det()) < 0,
-            inertial=inertial, points=points,
+            mesh, material, base=self.base, origin=(float(x), float(y)), angle=self.angle + turn,
+            mirrored=self.mirrored, inertial=inertial, points=points,
         )  # fmt: skip
         pad.E_ratio, pad.tau_ratio = self.E_ratio, self.tau_ratio
         return pad
+
+    def described(self) -> dict[str, Any]:
+        """Numbers and names of the pad as it is now, for files; not its mesh. Of a material of the
+        user's own only the small strains of the relaxed one are known."""
+        own = {name: getattr(self, name) for name in ("base", "angle", "mirrored", "inertial")}
+        ratios = {name: getattr(self, name) for name in ("E_ratio", "tau_ratio")}
+        known = {name: None if one is None else one.item() for name, one in ratios.items()}
+        material = None if len(self.material.added) else described(self.material)
+        if material is None:
+            relaxed = {name: getattr(self.material, name).item() for name in RELAXED}
+            material = {"kind": None, "finite": isinstance(self.material, Hyperelastic), **relaxed}
+        origin = self.origin.tolist()
+        return {**own, **known, "points": self.points, "origin": origin, "material": material}
+
+    @classmethod
+    def again(cls, described: Mapping[str, Any], mesh: Mesh) -> "Pad":
+        """The pad that was `described`, on its mesh."""
+        known = described["material"]
+        if known["kind"] is not None:
+            material = again(known)
+        elif known["finite"]:
+            material = Hyperelastic(known["E"], known["nu"], known["rho"], 1.0, known["depth"])
+        else:
+            material = Material(*(known[name] for name in RELAXED))
+        return cls(mesh, **{**described, "material": material})
 
     @property
     def E(self) -> Tensor:
@@ -363,6 +391,114 @@ class Pad(nn.Module):
         """Constants of every element (elements, 45) in the base's frame."""
         return constants_of(self.placed(self.mesh.nodes)[self.mesh.elements].tobytes())
 
+    # Fields inside of the pad, (..., mesh nodes or elements, components), in the pad's own axes.
+
+    def displacement(self, u: Array) -> Array:
+        """Displacements of all nodes of the mesh (..., mesh nodes, 2) [m], bonded ones too.
+
+        u (..., nodes, 2) [m]: displacements as a run records them, in the base's frame. A massless
+        pad has only its surface there; the interior is in equilibrium with it, u_i = -K_ii^-1 K_is
+        u_s.
+        """
+        mesh = self.mesh
+        own = (u.reshape(-1, *u.shape[-2:]) @ self.axes.numpy()).reshape(-1, 2 * u.shape[-2])
+        free = np.zeros((len(own), 2 * len(mesh.free)))
+        if self.nodal:
+            free[:] = own
+        else:
+            factor, interior, K_is = interior_solver(mesh, self.material.nu.item())
+            free[:, dofs_of(mesh.surface)] = own
+            free[:, interior] = -factor.solve(K_is @ own.T).T
+        out = np.zeros((len(own), len(mesh.nodes), 2))
+        out[:, mesh.free] = free.reshape(len(own), -1, 2)
+        return out.reshape(*u.shape[:-2], -1, 2)
+
+    def surface_points(self, u: Array) -> Array:
+        """Places (..., points, 2) [m] of the contact points in the frame of the base, of
+        displacements u (..., nodes, 2) [m] as a run records them."""
+        return (self.spread @ (self.positions + torch.from_numpy(u))).numpy()
+
+    def gradient(self, displacement: Array) -> Array:
+        """F (..., elements, 2, 2) at the centres of the elements, of displacements of all nodes."""
+        nodes = displacement[..., self.mesh.elements, :]
+        return np.eye(2) + np.einsum("eki,...ekj->...eji", slopes(self.mesh), nodes)
+
+    def strain(self, displacement: Array) -> Array:
+        """Strains (e_xx, e_yy, e_xy) at the centres of the elements (..., elements, 3), of
+        displacements of all nodes; of a pad at finite strain they are U - 1, F = R U."""
+        F = self.gradient(displacement)
+        U = 0.5 * (F + np.swapaxes(F, -1, -2))
+        if isinstance(self.material, Hyperelastic):
+            C, J = np.swapaxes(F, -1, -2) @ F, np.linalg.det(F)
+            U = (C + J[..., None, None] * np.eye(2)) / np.sqrt(
+                np.trace(C, axis1=-2, axis2=-1) + 2 * J
+            )[..., None, None]
+        return np.stack((U[..., 0, 0] - 1, U[..., 1, 1] - 1, U[..., 0, 1]), -1)
+
+    def largest_strain(self, u: Array) -> Array:
+        """Largest principal strain (...) at the centres of the elements, by its modulus, of
+        displacements u (..., nodes, 2) [m] as a run records them."""
+        e = self.strain(self.displacement(u))
+        mean, half = 0.5 * (e[..., 0] + e[..., 1]), 0.5 * (e[..., 0] - e[..., 1])
+        return (np.abs(mean) + np.hypot(half, e[..., 2])).max(-1)
+
+    @torch.inference_mode(False)
+    def stress(self, displacement: Array) -> Array:
+        """Elastic stresses (s_xx, s_yy, s_zz, s_xy) [Pa] (..., elements, 4) of the relaxed material
+        in plane strain, at the centres of the elements, of displacements of all nodes; Cauchy's of
+        a pad at finite strain, P F^T / det F of the first Piola-Kirchhoff stress P = dW/dF. The
+        part that the dashpots carry is not in them.
+
+        Raises `ValueError` for an energy of the user's own, which runs do not hold.
+        """
+        ratio = 1.0 if self.E_ratio is None else self.E_ratio.item()
+        if not isinstance(self.material, Hyperelastic):
+            strain = self.strain(displacement)
+            moduli = ratio * self.material.E.item(), self.material.nu.item()
+            lame_lambda, lame_mu = lame_moduli(*moduli)
+            mean = lame_lambda * (strain[..., 0] + strain[..., 1])
+            parts = [mean + 2 * lame_mu * strain[..., i] for i in (0, 1)]
+            return np.stack((*parts, mean, 2 * lame_mu * strain[..., 2]), -1)
+        if type(self.material) is Hyperelastic:
+            raise ValueError(
+                "the strain energy of the pad is one of your own, which runs do not hold, so that "
+                "its stresses are not known; plot something else"
+            )
+        F = plane(torch.from_numpy(self.gradient(displacement)))
+        with torch.enable_grad():
+            W = self.material.energy(F.requires_grad_()).sum()
+            (P,) = torch.autograd.grad(W, F)
+        stress = ratio * (P @ F.detach().mT / F.detach().det()[..., None, None]).numpy()
+        return np.stack([stress[..., i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1))], -1)
+
+
+RELAXED = ("E", "nu", "rho", "depth")
+"""Numbers of a material that files keep of one of the user's own."""
+
+
+def von_mises(stress: Array) -> Array:
+    """Von Mises' equivalent stress [Pa] (...) of stresses (..., 4)."""
+    xx, yy, zz, xy = (stress[..., i] for i in range(4))
+    return np.sqrt(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * xy**2)
+
+
+@lru_cache(maxsize=8)
+def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, Index, Array]:
+    """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in
+    `mesh.surface` order.
+
+    The interior's displacement depends on the surface's only, for any E and depth; both are 1.
+    """
+    K, surface = mesh.stiffness(*lame_moduli(1.0, nu)).tocsc(), dofs_of(mesh.surface)
+    interior = np.setdiff1d(np.arange(2 * len(mesh.free)), surface)
+    return splu(K[interior][:, interior]), interior, K[interior][:, surface].toarray()
+
+
+@lru_cache(maxsize=8)
+def slopes(mesh: Mesh) -> Array:
+    """Gradients (elements, 4, 2) [1/m] of the shape functions at the centres of the elements."""
+    return gradients(mesh.nodes[mesh.elements], 0.0, 0.0)[1]
+
 
 @lru_cache(maxsize=8)
 def constants_of(corners: bytes) -> Array:
@@ -393,15 +529,10 @@ def contact_points(mesh: Mesh, points: int) -> tuple[Any, Array, Array]:
     return np.stack((left, left + 1), -1), np.stack((1 - right, right), -1), lengths
 
 
-# Massless pads: motion of their contact points, from the relation between nodal forces and the
-# contact law.
+# Massless pads: the relation between nodal forces and rates.
 #
 # Rates are u' = free + P F with P = C sum of J / (tau + a h) and free = -C sum of J z / (tau + a
 # h); `stage` = a h is zero for the ODE itself. Static displacements are u = C F.
-
-
-HALVINGS = 12
-"""Halvings of a step of Newton's method at the most."""
 
 
 def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
@@ -409,81 +540,13 @@ def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
     [m/(N.s)], for the forces z (..., branches, nodes, 2) that have set in at the stage's start."""
     fractions, times = pad.chain()
     C, rest = pad.compliance(), fractions / (times + stage)
-    return -nodal(C, (rest[:, None, None] * z).sum(-3)), rest.sum() * C
+    return -under_forces(C, (rest[:, None, None] * z).sum(-3)), rest.sum() * C
 
 
-def nodal(A: Tensor, F: Tensor) -> Tensor:
-    """A F (..., nodes, 2) of forces on the nodes F (..., nodes, 2)."""
+def under_forces(A: Tensor, F: Tensor) -> Tensor:
+    """Displacements or rates A F (..., nodes, 2) of nodes under forces F (..., nodes, 2), A being
+    their compliance or mobility (2 nodes, 2 nodes)."""
     return (F.flatten(-2) @ A.mT).unflatten(-1, (-1, 2))
-
-
-def nodal_forces(
-    A: Tensor,
-    N: Tensor,
-    free: Tensor,
-    law: Callable[[Tensor], Tensor],
-    tolerance: float,
-    iterations: int,
-    first: Tensor | None = None,
-) -> tuple[Tensor, float]:
-    """Forces F = N^T f (..., nodes, 2) [N] of a law f(x) at contact points x = N (free + A F) (...,
-    points, 2), and the largest residual that is left of x.
-
-    A (2 nodes, 2 nodes) is the pad's compliance or mobility, N (points, nodes) its shape functions
-    at the points. Semi-smooth Newton from the forces `first` (..., points, 2), by default none, in
-    which the force on a point depends on its own x only, so that only the points with a slope are
-    unknowns. The last iteration is taken with the gradient on, which makes the derivative the
-    implicit function theorem's.
-    """
-    relation = A.detach()
-
-    def linearise(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mismatch of the forces, the mismatch of x that it causes, and the slopes (..., points, 2,
-        2) of the law."""
-        x = N @ (free + nodal(relation, N.mT @ f))
-        with torch.enable_grad():
-            twice = torch.stack((x, x)).requires_grad_()  # a copy for each component
-            at = law(twice)
-            components = (at[0, ..., 0] + at[1, ..., 1]).sum()
-            (G,) = torch.autograd.grad(components, twice, materialize_grads=True)
-        v = at[0].detach() - f
-        return v, N @ nodal(relation, N.mT @ v), G.movedim(0, -2)
-
-    def correction(v: Tensor, G: Tensor) -> Tensor:
-        """(1 - G B)^-1 v with B = N A N^T."""
-        sloped = torch.nonzero(G.flatten(-2).any(-1).reshape(-1, len(N)).any(0))[:, 0]
-        if not len(sloped):
-            return v
-        G, spread = G[..., sloped, :, :], torch.kron(N[sloped], torch.eye(2, dtype=N.dtype))
-        B = (spread @ relation @ spread.mT).unflatten(-1, (-1, 2))
-        J = torch.eye(len(spread), dtype=v.dtype) - torch.einsum(
-            "rpj,...pjk->...rpk", B, G
-        ).flatten(-2)
-        x = torch.linalg.solve(
-            J, (N @ nodal(relation, N.mT @ v))[..., sloped, :].flatten(-2)[..., None]
-        )
-        return v.index_add(-2, sloped, (G @ x.unflatten(-2, (-1, 2)))[..., 0])
-
-    with torch.no_grad():
-        f = torch.zeros(*free.shape[:-2], len(N), 2, dtype=free.dtype) if first is None else first
-        v, r, G = linearise(f)
-        for _ in range(iterations):
-            size = r.flatten(-2).norm(dim=-1)
-            going = r.abs().amax((-2, -1)) > tolerance
-            if not bool(going.any()):
-                break
-            way = correction(v, G) * going[..., None, None]
-            for _ in range(HALVINGS):  # sample by sample, until the residual falls
-                v, r, G = linearise(f + way)
-                worse = going & ~(r.flatten(-2).norm(dim=-1) < size)
-                if not bool(worse.any()):
-                    break
-                way = way * torch.where(worse, 0.5, 1.0)[..., None, None]
-            f = f + way
-        left = float(r.abs().max())
-        f = f + correction(v, G)
-    v = law(N @ (free + nodal(A, N.mT @ f))) - f
-    return N.mT @ (f + correction(v, G)), left
 
 
 # Taxels: an array of sensitive areas on the surface of a pad.

@@ -191,7 +191,7 @@ class Integral(nn.Module):
         return self.law(w, w_dot, feed_forward, q, q_dot) + self.Ki * integral, error[..., None]
 
 
-INSTANT = 1e-12
+NO_LAG = 1e-12
 """Time [s] that is added to a lag, so that there may be none."""
 
 
@@ -217,7 +217,7 @@ class Lagging(nn.Module):
     def forward(self, *given: Any) -> tuple[Tensor, Tensor]:
         *seen, z, stage = given
         wanted, rates = respond(self.law, seen, z[..., :-1], stage)
-        rate = (wanted - z[..., -1]) / (self.lag + INSTANT + stage)
+        rate = (wanted - z[..., -1]) / (self.lag + NO_LAG + stage)
         return z[..., -1] + stage * rate, torch.cat((rates, rate[..., None]), -1)
 
 
@@ -240,6 +240,8 @@ def begun(law: Callable[..., Any], seen: Sequence[Tensor]) -> Tensor:
 class Guide(nn.Module):
     """Resistance of a guide to its coordinate's rate v: F = -friction v / sqrt(v^2 + v_0^2) -
     damping v; dry friction is smooth below the speed v_0."""
+
+    resists: ClassVar = True
 
     def __init__(
         self,
@@ -302,7 +304,9 @@ class Actuator(nn.Module):
     called with two more arguments, the states z* (..., n) at the start of a stage and the stage's
     length a h [s], and gives the effort and the rates z' (..., n), with the values z* + a h z' that
     act at the end of the stage. The effort saturates at a `limit` [N or N.m], which is not smooth;
-    states go on as if it did not. `elements` are the graph's names of the elements behind it.
+    states go on as if it did not. A law that says `resists = True` is a resistance between the
+    coordinate that it pushes and the ground: its power is dissipated, that of others supplied.
+    `elements` are the graph's names of the elements behind it.
     Raises `ValueError` unless names are given, and for more set-points than coordinates.
     """
 
@@ -345,6 +349,11 @@ class Actuator(nn.Module):
     def is_loop(self) -> bool:
         """Whether the actuator is the loop of one coordinate, which follows one set-point."""
         return len(self.measures) == len(self.setpoints) == 1
+
+    @property
+    def resists(self) -> bool:
+        """Whether the law is a resistance, which takes power out."""
+        return getattr(self.law, "resists", False)
 
     @property
     def measured(self) -> str:

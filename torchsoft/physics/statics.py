@@ -7,21 +7,20 @@ from point to point and f the contact law, without any rate, at the bodies' give
 points' given stretches. A nodal pad's elements are in balance with f(u), its branches relaxed.
 """
 
-import math
 from collections import deque
 from collections.abc import Container, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchsoft.parallel import one_torch_thread, ungraphed
-from torchsoft.physics.balance import Balance
+from torchsoft.physics.balance import Nodes, contact_forces, corrected, newton
 from torchsoft.physics.contact import cross, turned
 from torchsoft.physics.graph import Graph
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import net_efforts
-from torchsoft.physics.pads import nodal_forces
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.state import State
 from torchsoft.physics.structure import values_of
@@ -136,7 +135,7 @@ def carried(rig: Graph, name: str, state: State, known: dict[str, Tensor] | None
         found, left = displaced(rig, name, state, batch, {} if known is None else known)
     elif own:
         law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
-        found, left = nodal_forces(
+        found, left = contact_forces(
             pad.compliance(), pad.spread, undeformed, law, RESIDUAL, SETTLING
         )
     if not left <= RESIDUAL:
@@ -155,26 +154,25 @@ def displaced(
     """Displacements (*batch, nodes, 2) [m] of a nodal pad in balance with its contacts, in a batch
     of copies of one state, and the largest step that is left."""
     pad, own, first = rig.pads[name], rig.contacts_of(name), (0,) * len(batch)
-    part = lambda values: {key: value[first].detach() for key, value in values.items()}
-    alone = State({}, part(state.stretch), part(state.pose), {}, part(state.velocity))
-    balances = []
-    for one in (alone, state):
-        law = lambda u, one=one: rig.point_forces(own, one, u, torch.zeros_like(u))
-        balances.append(Balance(pad, pad.element_forces, law))
-    undeformed, law = torch.zeros(pad.nodes, 2, dtype=torch.float64), balances[0].law
-    assert law is not None
+
+    def law(u: Tensor, state: State, part: float = 1.0) -> Tensor:
+        return part * rig.point_forces(own, state, u, torch.zeros_like(u))
+
+    alone = lambda values: {key: value[first].detach() for key, value in values.items()}
+    one = State({}, alone(state.stretch), alone(state.pose), {}, alone(state.velocity))
+    undeformed = torch.zeros(pad.nodes, 2, dtype=torch.float64)
     begins = [(known[name], (1.0,))] if name in known else []
     for u, parts in (*begins, (undeformed, (1.0,)), (undeformed, SOFTER)):
         try:
             for part in parts:
-                softer = Balance(pad, pad.element_forces, lambda u, part=part: part * law(u))
-                u, factors, left = softer.found(u, RESIDUAL, SETTLING)
+                softer = Nodes(pad, pad.element_forces, partial(law, state=one, part=part))
+                u, solve, left = newton(softer, u, RESIDUAL, SETTLING)
         except FloatingPointError:
             continue
         if left <= RESIDUAL:
             known[name] = u
-            copies = math.prod(batch)
-            return balances[1].corrected(u.expand(*batch, -1, -1), copies * factors), left
+            copies = Nodes(pad, pad.element_forces, partial(law, state=state))
+            return corrected(copies, u.expand(*batch, -1, -1), solve), left
     return undeformed, torch.inf
 
 
@@ -184,7 +182,7 @@ def carried_along(rig: Graph, name: str, state: State, u: Tensor) -> Tensor:
     return velocity[:2] + velocity[2] * cross(turned(rig.pads[name].positions + u, pose[2]))
 
 
-def condensed(rig: Graph) -> Graph:
+def with_condensed_pads(rig: Graph) -> Graph:
     """The rig with all pads linear and massless, on their surface alone; itself if they are."""
     if not any(pad.nodal for pad in rig.pads.values()):
         return rig

@@ -84,6 +84,31 @@ class Structure:
         key.append(tuple(children.items()))
         return number
 
+    def copy(self, values: Sequence[Tensor], apart: bool = True) -> list[Any]:
+        """The modules of a copy with these parameters, in the structure's order; the part itself
+        comes first. Its buffers, lists and arrays are copies too where it is `apart`."""
+        out: list[Any] = [type(module).__new__(type(module)) for module in self.modules]
+        given = iter(values)
+        for module, own, children in zip(self.modules, out, self.children):
+            mine = own.__dict__
+            mine.update(module.__dict__)
+            if apart:
+                for name, value in module.__dict__.items():
+                    if type(value) in (dict, list, np.ndarray):
+                        mine[name] = value.copy()
+                mine["_buffers"] = {
+                    name: None if buffer is None else buffer.detach().clone()
+                    for name, buffer in module._buffers.items()
+                }
+            mine["_parameters"] = {
+                name: None if value is None else next(given)
+                for name, value in module._parameters.items()
+            }
+            mine["_modules"] = {
+                name: None if number is None else out[number] for name, number in children.items()
+            }
+        return out
+
 
 @cache
 def _idle(kind: type) -> frozenset[str]:
@@ -126,56 +151,6 @@ def described(value: Any) -> Any:
     ):
         return value
     raise Unknown
-
-
-class Copies:
-    """Copies of a part, of whose parameters each has its own: of the same structure as the part
-    when this was made, whatever happens to that later."""
-
-    def __init__(self, structure: Structure) -> None:
-        self._kinds = [type(module) for module in structure.modules]
-        self._children, self._own = structure.children, list[dict[str, Any]]()
-        self._parameters = [[*module._parameters] for module in structure.modules]
-        self._there = [
-            [value is not None for value in module._parameters.values()]
-            for module in structure.modules
-        ]
-        self._buffers = list[dict[str, Any]]()
-        for module in structure.modules:
-            apart = "_parameters", "_buffers", "_modules"
-            own = {k: v for k, v in vars(module).items() if k not in apart}
-            for name, value in own.items():
-                if type(value) in (dict, list, np.ndarray):
-                    own[name] = value.copy()
-            self._own.append(own)
-            buffers = module._buffers.items()
-            self._buffers.append({k: v if v is None else v.detach().clone() for k, v in buffers})
-
-    def made(self, values: Sequence[Tensor]) -> list[Any]:
-        """The modules of a copy with these parameters, in the structure's order; the part itself
-        comes first."""
-        out: list[Any] = [kind.__new__(kind) for kind in self._kinds]
-        given = iter(values)
-        parts = zip(
-            out,
-            self._own,
-            self._parameters,
-            self._there,
-            self._buffers,
-            self._children,
-            strict=True,
-        )
-        for module, own, names, there, buffers, children in parts:
-            mine = module.__dict__
-            mine.update(own)
-            mine["_parameters"] = {
-                name: next(given) if here else None for name, here in zip(names, there)
-            }
-            mine["_buffers"] = buffers
-            mine["_modules"] = {
-                name: None if number is None else out[number] for name, number in children.items()
-            }
-        return out
 
 
 def values_of(part: nn.Module, *given: Tensor) -> tuple[Any, ...]:

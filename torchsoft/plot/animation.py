@@ -20,7 +20,7 @@ from torchsoft.display import hidden, suggestion
 from torchsoft.extras import needed
 from torchsoft.files import replacing, save_text
 from torchsoft.physics.mesh import Array
-from torchsoft.physics.setup import von_mises
+from torchsoft.physics.pads import von_mises
 from torchsoft.plot.dashboard import (
     ACTUAL,
     RIPPLE,

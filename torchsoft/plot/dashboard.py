@@ -19,8 +19,8 @@ from matplotlib.ticker import MaxNLocator
 from torchsoft.display import suggestion
 from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.mesh import Array
+from torchsoft.physics.pads import von_mises
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.setup import von_mises
 from torchsoft.plot.figures import (
     COLOURS,
     DESIRED,
@@ -165,8 +165,6 @@ def points(axes: Axes, run: Trajectory, touching: Chart, slipping: Chart) -> Non
         axes.step(t, values, where="mid", color=colour, label=name)
         axes.fill_between(t, 0, slipping.curves[name], step="mid", color=colour, alpha=0.45, lw=0)
     axes.fill_between([], [], color=INK, alpha=0.45, lw=0, label="of these slip")
-    if any(bool((state < 0).any()) for state in run.contact_state.values()):
-        axes.set_title("slip not known: the rig has changed since", fontsize="small", loc="right")
     axes.set_ylim(0, None)
     axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
     legend_above(axes)
@@ -261,7 +259,7 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
         return
     axes.set_xlabel("x [mm]" if along[0] > 0.999 else "along the surface [mm]")
     legend_above(axes)
-    area = pad.depth * pad.lengths[near]
+    area = pad.material.depth.item() * pad.point_lengths[near]
     if np.ptp(area) < 1e-6 * area[0]:  # else a force is not the same pressure everywhere
         scale = 1e-3 / float(area[0])
         both = partial(np.multiply, scale), partial(np.multiply, 1 / scale)

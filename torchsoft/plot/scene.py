@@ -19,7 +19,8 @@ from scipy.ndimage import binary_dilation
 
 from torchsoft.physics.energy import SEPARATED, SLIPPING, STICKING
 from torchsoft.physics.mesh import Array
-from torchsoft.physics.setup import PadSetup, Setup, von_mises
+from torchsoft.physics.pads import Pad, von_mises
+from torchsoft.physics.setup import Setup
 from torchsoft.solve.trajectory import Trajectory
 
 NORMAL, FRICTION, INK = "#cc3311", "#0077bb", "#333333"
@@ -115,20 +116,20 @@ def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
     return shown
 
 
-def own_axes(pad: PadSetup, base: Array) -> Array:
+def own_axes(pad: Pad, base: Array) -> Array:
     """A pad's x and y axes (2, 2) as unit vectors of the world; base (3,) is the pose of its
     base."""
-    return in_world(pad.axes.T, base) - base[:2]
+    return in_world(pad.axes.numpy().T, base) - base[:2]
 
 
-def along_surface(pad: PadSetup, base: Array) -> Array:
+def along_surface(pad: Pad, base: Array) -> Array:
     """Unit vector (2,) along a pad's surface that points to the right, or up where it is steep: the
     same way while a finger leans."""
     x = own_axes(pad, base)[0]
     return x if x[int(abs(x[0]) < STEEP)] > 0 else -x
 
 
-def friction_sign(pad: PadSetup, base: Array) -> float:
+def friction_sign(pad: Pad, base: Array) -> float:
     """1 where the recorded friction is positive along `along_surface`, else -1. Records use the
     frame whose normal points into the pad, for mirrored pads too."""
     x, y = own_axes(pad, base)[1]
@@ -143,7 +144,7 @@ def outwards(setup: Setup, instant: Instant) -> str:
     return "outwards: to the right or up" if steep else "outwards: to the right"
 
 
-def own_places(pad: PadSetup, base: Array, own: Array) -> Array:
+def own_places(pad: Pad, base: Array, own: Array) -> Array:
     """Points (..., 2) [mm] in the world from the pad's own frame [mm]."""
     return in_world(MM * pad.placed(own / MM), base)
 
@@ -182,7 +183,8 @@ def plates(setup: Setup) -> dict[str, float]:
     out = {}
     for name, pad in setup.pads.items():
         if pad.base is not None:
-            height = MM * float((pad.placed(np.zeros(2)) @ pad.axes)[1])  # of face over centre
+            origin = pad.placed(np.zeros(2)) @ pad.axes.numpy()
+            height = MM * float(origin[1])  # of face over centre
             if setup.bodies[pad.base].outline is not None:
                 out[name] = 0.0
             elif height > 5e-7:
@@ -191,7 +193,7 @@ def plates(setup: Setup) -> dict[str, float]:
     return {name: out.get(name, thickest) for name in setup.pads}
 
 
-def behind(pad: PadSetup, base: Array, depth: float, *, wider: float = 0.0) -> Array:
+def behind(pad: Pad, base: Array, depth: float, *, wider: float = 0.0) -> Array:
     """Corners (4, 2) [mm] of the rectangle of a `depth` behind a pad's bonded face, `wider` [mm]
     than the face on each side; base (3,) is the pose of the pad's base."""
     (left, face), (right, _) = MM * pad.mesh.base + [[-wider, 0.0], [wider, 0.0]]

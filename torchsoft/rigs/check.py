@@ -23,6 +23,7 @@ from torchsoft.rigs.schema import RigTables
 from torchsoft.solve import simulate
 from torchsoft.solve.kernel.arrays import PASSED
 from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.trajectory import Trajectory
 
 LOOSE = 1e-3
 """Relative tolerance of the run that is judged: forces to 1 %."""
@@ -182,7 +183,7 @@ def trial(ready: BuiltRig) -> list[Diagnostic]:
             tolerance = file.solver.tolerance
             task = simulate.prepare(ready.rig, t, y0=ready.y0, rtol=LOOSE, tolerance=tolerance)
             done = simulate.run(task, 0.0, explained=False, effort=EFFORT)
-            trajectory = done.trajectory(done.solved.rows)
+            trajectory = Trajectory.of(done, done.rows)
         except SimulationFailed as failure:
             found, trajectory = [findings.end(file, failure)], failure.trajectory
         except ValueError as error:

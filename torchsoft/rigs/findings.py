@@ -11,10 +11,11 @@ from torch import Tensor
 
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.graph import Graph
+from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.motion import hold
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
-from torchsoft.physics.statics import NoEquilibrium, condensed, standing
+from torchsoft.physics.statics import NoEquilibrium, standing, with_condensed_pads
 from torchsoft.rigs.built import BuiltRig
 from torchsoft.rigs.geometry import Scene, at
 from torchsoft.rigs.schema import RigTables
@@ -127,8 +128,8 @@ def strains(run: Run) -> Iterator[Diagnostic]:
     """Findings on linear pads that are strained beyond linear elasticity, and notes on strains that
     are not small."""
     for name, u in run.trajectory.displacement.items():
-        pad, setup = run.rig.pads[name], run.trajectory.setup.pads[name]
-        if setup.finite:
+        pad = run.rig.pads[name]
+        if isinstance(pad.material, Hyperelastic):
             continue
         give = u.detach().norm(dim=-1)
         row, node = divmod(int(give.argmax()), give.shape[1])
@@ -146,7 +147,7 @@ def strains(run: Run) -> Iterator[Diagnostic]:
                 f"{part:.0%} of its height, and forces are wrong above {LINEAR:.0%}; press "
                 "or move less, take less friction, or a thicker or stiffer pad",
             )  # fmt: skip
-        elif (strain := float(setup.largest_strain(u[row].detach().numpy()))) > SMALL_STRAIN:
+        elif (strain := float(pad.largest_strain(u[row].detach().numpy()))) > SMALL_STRAIN:
             yield Diagnostic("note", f"pads.{name}", strained(strain, run.time(row)))
 
 
@@ -253,7 +254,7 @@ def untied(run: Run) -> Iterator[Diagnostic]:
 def stability(run: Run) -> tuple[Diagnostic | None, float]:
     """A finding on the modes where the contacts carry most, by the growth of one that a loop
     reaches: a disc on the top of a node rolls off it in any case. And the fastest swing [rad/s]."""
-    row, rig, loops = run.loaded(), condensed(run.rig), run.file.loops()
+    row, rig, loops = run.loaded(), with_condensed_pads(run.rig), run.file.loops()
     poses = {name: pose[row].detach() for name, pose in run.trajectory.state.pose.items()}
     still = hold(**{name: float(run.trajectory[name][row]) for name in rig.signals})
     try:

@@ -20,9 +20,9 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.structure import Structure
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts
-from torchsoft.solve.gradients import TAPE_BYTES, attached
+from torchsoft.solve.gradients import TAPE_BYTES, Solved, attached
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import Initial, RunOutcome, Start, prepare, run
+from torchsoft.solve.simulate import Initial, Start, prepare, run
 from torchsoft.solve.trajectory import Trajectory
 
 
@@ -188,22 +188,22 @@ def simulate_batch(
         if isinstance(rig, Rig)
     }
 
-    def work(i: int) -> RunOutcome | Trajectory | Exception:
+    def work(i: int) -> Solved | Trajectory | Exception:
         try:
             own = own_values(runs[i]["rig"], parameters or {}, i)
             structure = structures.get(id(runs[i]["rig"]))
             task = prepare(**runs[i], structure=structure, values=own, **options)
-            outcome = run(task, budget, explained=False)
-            return outcome.trajectory() if outcome.solved.segments is None else outcome
+            solved = run(task, budget, explained=False)
+            return Trajectory.of(solved) if solved.segments is None else solved
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
             return failure
 
-    results: list[RunOutcome | Trajectory | Exception] = [ValueError("not run")] * count
+    results: list[Solved | Trajectory | Exception] = [ValueError("not run")] * count
     with single_threaded(), tqdm(total=count, unit="run", disable=hidden(progress)) as bar:
         for i, result in parallel_map(work, count, threads, turns=True):
             results[i] = result
             bar.update()
-    done = {i: result for i, result in enumerate(results) if isinstance(result, RunOutcome)}
+    done = {i: result for i, result in enumerate(results) if isinstance(result, Solved)}
     failures = {i: result for i, result in enumerate(results) if isinstance(result, Exception)}
     if failures:
         first = min(failures)
@@ -214,10 +214,9 @@ def simulate_batch(
             raise failures[first]  # nothing of a single run
         message = f"{len(failures)} of {count} runs failed; run {first}: {failures[first]}"
         warn(message, SamplesFailed)
-    states = attached([one.solved for one in done.values()], threads)
     trajectories = [one if isinstance(one, Trajectory) else None for one in results]
-    for (i, outcome), rows in zip(done.items(), states):
-        trajectories[i] = outcome.trajectory(rows)
+    for (i, solved), rows in zip(done.items(), attached([*done.values()], threads)):
+        trajectories[i] = Trajectory.of(solved, rows)
     _doubt([one["rig"] for one in runs], trajectories)
     return Batch(
         tuple(trajectories),

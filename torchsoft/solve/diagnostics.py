@@ -14,9 +14,9 @@ from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, condensed, standing
+from torchsoft.physics.statics import NoEquilibrium, standing, with_condensed_pads
 from torchsoft.solve.steps import UNITS, own_units
-from torchsoft.solve.trajectory import Ledger, Trajectory, displaced
+from torchsoft.solve.trajectory import Trajectory
 
 # Checks of a finished run: whether its energies balance, and whether its pads are pressed beyond
 # the theory.
@@ -45,6 +45,9 @@ COMPRESSED = 0.5
 LATER = 0.005
 """Part of a contact's largest friction by which the bound of its fall raises it without a word."""
 
+UNLOADED = 1e-9
+"""Nodal force [N] up to which a node counts as unloaded."""
+
 SMALL_STRAIN = 0.05
 """Strain up to which linear elasticity holds without a note."""
 
@@ -58,22 +61,24 @@ def strained(strain: float, time: float) -> str:
     )
 
 
-def energy_scale(ledger: Ledger) -> float:
-    """Energy [J] by which a run's ledger is judged: stored at the start, and injected since."""
-    return max(float(ledger.stored[0]) + ledger.injected, NEGLIGIBLE)
+def energy_scale(run: Trajectory) -> float:
+    """Energy [J] by which a run is judged: stored at the start, and injected since."""
+    return max(run.stored_energy[0].item() + run.injected[-1].item(), NEGLIGIBLE)
 
 
-def missing_energy(ledger: Ledger) -> float:
-    """Part of `energy_scale` that a run's ledger lacks, or has too much, at the most."""
-    left = ledger.stored - ledger.stored[0] - ledger.supplied + ledger.dissipated.sum(1)
-    return float(np.abs(left).max()) / energy_scale(ledger)
+def missing_energy(run: Trajectory) -> float:
+    """Part of `energy_scale` that a run lacks, or has too much, at the most."""
+    total = lambda parts: sum(part.detach().numpy() for part in parts.values())
+    stored = run.stored_energy.numpy()
+    left = stored - stored[0] - total(run.supplied) + total(run.dissipated)
+    return float(np.abs(left).max()) / energy_scale(run)
 
 
 def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> dict[str, str]:
     """Run warnings: sentences on the faults of a finished run with a ledger, by their subject; on
     those of its gradient if it has one, or is said to be `differentiated`."""
-    run, ledger, found = trajectory, Ledger.of(trajectory), dict[str, str]()
-    scale, part = energy_scale(ledger), missing_energy(ledger)
+    run, found = trajectory, dict[str, str]()
+    scale, part = energy_scale(run), missing_energy(run)
     if not part <= RESIDUAL:
         longest = float(run.knots.diff().max())
         better = 0.4 * longest * min(1.0, RESIDUAL / part)
@@ -82,27 +87,29 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
             f"and injected since is missing or too much, with steps of {longest:.3g} s; try steps "
             f"of {better:.2g} s"
         )
-    falls = -np.diff(ledger.dissipated, axis=0).min(0, initial=0.0)
-    for name, back in zip(ledger.names, falls):
+    for name, energy in run.dissipated.items():
+        back = -np.diff(energy.detach().numpy()).min(initial=0.0)
         if back > SUPPLIED * scale:
             found[f"dissipated {name}"] = (
                 f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "
                 "check its law"
             )
-    if run.stats.failed_steps and "knots" in ledger.steps:
+    if run.stats.failed_steps and "knots" in run.step_choice:
         found["knots"] = (
             "Newton did not converge in some steps between the given `knots`, which were halved "
             "(`stats.failed_steps`): the run is not one of the same steps; its own `knots` are "
             "those that it took"
         )
-    slips = dict(zip(ledger.names, ledger.dissipated[-1]))["slip"] > 0
+    slips = bool(run.dissipated["slip"][-1] > 0)
     biased = slips and (differentiated or run.y.requires_grad or run.sensitivities is not None)
     for name in rig.contacts:
         if bounded := softened(run, rig, name):
             found[f"friction {name}"] = f"contact `{name}`: {bounded}"
         if biased and (jump := jumped(run, rig, name)):
             found[f"gradient {name}"] = jump
-    most, atol = ledger.force, ledger.steps.get("atol", 0.0)
+    pairs = (np.moveaxis(x.detach().numpy(), -1, 0) for x in run.force.values())
+    most = max((float(np.sqrt((N**2 + T**2).max())) for N, T in pairs), default=0.0)
+    atol = run.step_choice.get("atol", 0.0)
     if 0 < RESOLVED * most < atol * UNITS["force"]:
         unit = own_units(rig)["force"]
         if RESOLVED * most < (off := atol * unit):
@@ -118,14 +125,28 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
         if isinstance(pad.material, Hyperelastic):
             continue
         limit, height = COMPRESSED * pad.mesh.height, pad.mesh.height
-        if 2 * ledger.displaced.get(name, np.inf) < limit:  # other nodes give way by less
-            continue
-        if not (deepest := displaced(run, name)) <= limit:
+        if not pad.nodal and 2 * largest_under_load(run, rig, name) < limit:
+            continue  # other nodes are displaced less
+        deepest = float(run.displacement[name].detach().norm(dim=-1).max())
+        if not deepest <= limit:
             found[f"pad {name}"] = (
                 f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond "
                 "linear elasticity"
             )
     return found
+
+
+def largest_under_load(run: Trajectory, rig: Rig, name: str) -> float:
+    """Largest displacement [m] of the loaded nodes of a condensed pad in a run."""
+    pad, here = rig.pads[name], run.layout.slices["pads", name]
+    softness = 1 / (pad.E.item() * pad.material.depth.item())
+    fractions = pad.chain()[0].detach().numpy()
+    z = run.y.detach().numpy()[:, here].reshape(len(run.t), len(fractions), -1)
+    z = z[:, 0] if len(fractions) == 1 else fractions @ z
+    loaded = np.flatnonzero(np.abs(z).max(0) > UNLOADED) // 2 * 2
+    span = slice(*loaded[[0, -1]] + [0, 2]) if len(loaded) else slice(0)
+    u = softness * (z[:, span] @ pad.unit_compliance()[0].numpy()[span, span])
+    return float(np.sqrt((u[:, ::2] ** 2 + u[:, 1::2] ** 2).max(initial=0.0)))
 
 
 @torch.no_grad()
@@ -275,7 +296,7 @@ def instability(rig: Rig, run: Trajectory) -> str:
     grows there, or one does without loops."""
     if not run.force or not rig.actuators:
         return ""
-    soft = condensed(rig)
+    soft = with_condensed_pads(rig)
     least = torch.stack([force.detach()[..., 0].sum(-1) for force in run.force.values()]).amin(0)
     for k in least.argsort(descending=True)[:POSES].tolist():
         try:

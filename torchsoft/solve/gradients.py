@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -10,13 +10,14 @@ from torch import Tensor
 
 from torchsoft.caller import warn
 from torchsoft.parallel import parallel_map, released_turn
+from torchsoft.physics.channels import Sums
+from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout
 from torchsoft.solve.kernel.arrays import Backward, Forward
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
-from torchsoft.solve.trajectory import Sums
 
 # Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in
 # the compiled kernels.
@@ -63,63 +64,69 @@ class GradientFailed(RuntimeError):
     """A gradient that there is not, or that is not finite: when [s] it ceased to be."""
 
 
-class Rows(NamedTuple):
-    """Differentiable outputs of a run: states (T, size), and forces (T, recorded) as
-    `recorded_size` orders them."""
+Route = Literal["none", "discrete", "forward"]
+"""Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`."""
 
-    y: Tensor
-    recorded: Tensor
+
+class Task(NamedTuple):
+    """A run that may begin: the arguments of `simulate`, checked. The stepper has a snapshot of the
+    `rig`; `leaves` are the parameters `wrt`, and more tensors, of which start and reference were
+    made."""
+
+    stepper: ImplicitStepper
+    t: Tensor
+    y0: Tensor
+    gradient: Route = "discrete"
+    wrt: tuple[str, ...] = ()
+    dy0: Tensor | None = None
+    rigid: bool = False
+    touch: tuple[str, ...] = ()
+    rig: Rig | None = None
+    leaves: tuple[Tensor, ...] = ()
 
 
 class Solved(NamedTuple):
-    """A run, finished or growing: its inputs, its results, its segments where a gradient is needed,
-    and the derivatives of states and of sums of forces where those are asked for."""
+    """A run, finished or growing: its results, its segments where a gradient is needed, and the
+    derivatives of states and of sums of forces where those are asked for."""
 
-    stepper: ImplicitStepper
-    y0: Tensor
-    t: Tensor
+    task: Task
     out: Progress
     segments: list[Segment] | None
     slopes: tuple[Tensor, Tensor] | None = None
 
     @property
-    def rows(self) -> Rows:
-        """Results without a graph."""
-        return Rows(torch.from_numpy(self.out.y), torch.from_numpy(self.out.recorded))
+    def rows(self) -> tuple[Tensor, Tensor]:
+        """States (T, size) and recorded forces (T, recorded), without a graph."""
+        return torch.from_numpy(self.out.y), torch.from_numpy(self.out.recorded)
 
 
-def march(
-    stepper: ImplicitStepper, y0: Tensor, t: Tensor, tape_bytes: float = TAPE_BYTES
-) -> Iterator[Solved]:
-    """The run from y0 (size,) through the times t (T,), after every compiled call; the last is
-    complete."""
-    segments: list[Segment] | None = (
-        [] if torch.is_grad_enabled() and wants_gradient(stepper, y0) else None
-    )
-    for out in stepper.integrate(y0.detach(), t, segments, tape_bytes):
-        yield Solved(stepper, y0, t, out, segments)
+def march(task: Task, tape_bytes: float = TAPE_BYTES) -> Iterator[Solved]:
+    """The run after every compiled call; the last is complete."""
+    wanted = torch.is_grad_enabled() and wants_gradient(task.stepper, task.y0)
+    segments: list[Segment] | None = [] if wanted else None
+    for out in task.stepper.integrate(task.y0.detach(), task.t, segments, tape_bytes):
+        yield Solved(task, out, segments)
 
 
-def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
-    """The rows of finished runs with the discrete adjoint behind them, by y0, parameters and
+def attached(runs: Sequence[Solved], threads: int = 1) -> list[tuple[Tensor, Tensor]]:
+    """The `rows` of finished runs with the discrete adjoint behind them, by y0, parameters and
     signals, but not by the times, where anything wants it. The backward sweeps of several runs go
     side by side in so many threads."""
     differentiated = [run for run in runs if run.segments is not None]
     inputs: list[Tensor] = []
     for run in differentiated:
-        stepper = run.stepper
+        stepper, t = run.task.stepper, run.task.t
         times = [segment.plan.stage_times.ravel() for segment in run.segments or []]
-        signals = stepper.signals_at(np.concatenate([*times, run.t.numpy() - stepper.origin]))
-        at_stages, at_outputs = signals[: -len(run.t)], signals[-len(run.t) :]
-        inputs += [run.y0, stepper.compiled.p, at_stages, at_outputs]
+        signals = stepper.signals_at(np.concatenate([*times, t.numpy() - stepper.origin]))
+        inputs += [run.task.y0, stepper.parameters.p, signals[: -len(t)], signals[-len(t) :]]
     flat = iter(_Solutions.apply(differentiated, threads, *inputs) if differentiated else ())
-    solutions = map(Rows, flat, flat)
+    solutions = zip(flat, flat)
     return [run.rows if run.segments is None else next(solutions) for run in runs]
 
 
 def wants_gradient(stepper: ImplicitStepper, y0: Tensor) -> bool:
     """Whether anything that a run is made with requires a gradient."""
-    tensors = (y0, stepper.compiled.p, *stepper.reference.parameters())
+    tensors = (y0, stepper.parameters.p, *stepper.reference.parameters())
     return any(x.requires_grad for x in tensors) or stepper.signals_at_start.requires_grad
 
 
@@ -144,7 +151,7 @@ class _Solutions(torch.autograd.Function):
             )
         bars: list[Tensor | None] = [None] * (4 * len(ctx.runs))
         pairs = list(zip(given[::2], given[1::2]))
-        needed = [i for i, (y, felt) in enumerate(pairs) if y is not None or felt is not None]
+        needed = [i for i, (y, forces) in enumerate(pairs) if y is not None or forces is not None]
 
         def sweep(k: int) -> tuple[Tensor, ...]:
             return run_adjoint(ctx.runs[needed[k]], *pairs[needed[k]])
@@ -154,44 +161,51 @@ class _Solutions(torch.autograd.Function):
         return None, None, *bars
 
 
+def columned(bars: Array) -> Array:
+    """Cotangents (., signals, 2) of signals, as (., 2 signals, 1)."""
+    return bars.reshape(len(bars), bars.shape[-2] * bars.shape[-1], 1)
+
+
 def run_adjoint(
     run: Solved, y_bar: Tensor | None, recorded_bar: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Cotangents of y0 (size,), of the parameters' vector and of the signals at stages and outputs
     (., signals, 2), from those of the rows. Raises `GradientFailed` where one is not finite."""
-    stepper, size = run.stepper, run.stepper.layout.size
-    rows: Array = np.zeros((len(run.t), size)) if y_bar is None else y_bar.numpy().copy()
-    felt: Array = np.zeros((len(run.t), 0))
+    stepper, t = run.task.stepper, run.task.t
+    size = stepper.layout.size
+    rows: Array = np.zeros((len(t), size)) if y_bar is None else y_bar.numpy().copy()
+    forces: Array = np.zeros((len(t), 0))
     if recorded_bar is not None:
-        felt = np.ascontiguousarray(recorded_bar.numpy())
-    for bar in rows, felt:
+        forces = np.ascontiguousarray(recorded_bar.numpy())
+    for bar in rows, forces:
         if not np.isfinite(bar).all():
             raise GradientFailed(
                 f"the cotangent of output {np.argwhere(~np.isfinite(bar))[0][0]} is not finite"
             )
     sizes = sizes_of(stepper.layout, run.out.y)
     own = float((np.abs(rows) @ sizes).sum())
-    own += float(np.abs(felt).sum()) * float(np.abs(run.out.recorded).max(initial=SMALL))
-    carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
-    segments, outputs_bar = run.segments or [], np.zeros((len(run.t), *run.out.signals.shape[1:]))
+    own += float(np.abs(forces).sum()) * float(np.abs(run.out.recorded).max(initial=SMALL))
+    carried, p_bar = np.zeros(size), np.zeros(len(stepper.parameters.p))
+    segments, outputs_bar = run.segments or [], np.zeros((len(t), *run.out.signals.shape[1:]))
     signals_bar = [np.zeros_like(segment.stages) for segment in segments]
-    room = stepper.compiled.model.take(stepper.compiled.numbers)
+    room = stepper.parameters.model.take(stepper.parameters.numbers)
     for segment, own_bar in zip(reversed(segments), reversed(signals_bar)):
         plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
         failed, here = np.zeros(1, np.int64), segment.rows
         sweep = Backward(
-            room.system, room.work, room.of("Cotangents"), tape,
+            room.system, room.work, room.of("Directions", columns=1), tape,
             plan.h, segment.stages, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
-            rows[here], felt[here], outputs_bar[here], carried, p_bar, own_bar, failed,
+            rows[here], forces[here], columned(outputs_bar[here]), carried[:, None], p_bar[:, None],
+            columned(own_bar), failed,
         )  # fmt: skip
         with released_turn():
             call("backward", sweep)
         if failed[0] >= 0:
             time = stepper.origin + plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
-    stepper.compiled.model.give(room)
+    stepper.parameters.model.give(room)
     if own > 0:
-        by_parameters = np.abs(p_bar * stepper.compiled.p.detach().numpy()).max(initial=0.0)
+        by_parameters = np.abs(p_bar * stepper.parameters.p.detach().numpy()).max(initial=0.0)
         warn_of_amplified(max(np.abs(carried * sizes).max(), by_parameters) / own)
     parts = carried, p_bar, np.concatenate(signals_bar), outputs_bar
     return tuple(torch.from_numpy(part) for part in parts)  # pyright: ignore[reportReturnType]
@@ -263,7 +277,7 @@ def signal_directions(
     signals = stepper.signals_at(times)
     out = np.zeros((*signals.shape[:2], 2, columns))
     out[..., : len(wrt)] = directions(signals, wrt)
-    driving = stepper.compiled.system.body_signal
+    driving = stepper.parameters.system.body_signal
     if out[:, driving[driving >= 0]].any():
         raise ValueError(
             "gradient='forward' has no derivatives by parameters that move fixed or driven bodies; "
@@ -272,41 +286,39 @@ def signal_directions(
     return out.reshape(len(times), -1, columns)
 
 
-def iterate(
-    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wrt: Sequence[Tensor], dy0: Tensor | None,
-    columns: list[int], sums: Sums, of_signals: Sequence[Tensor] = (),
-) -> Iterator[Solved]:  # fmt: skip
+def iterate(task: Task, wrt: Sequence[Tensor], columns: list[int], sums: Sums) -> Iterator[Solved]:
     """The run with derivatives (T, components, n) of the states by the scalar tensors `wrt`, and
     those of sums of forces (T, sums, n), as it grows; `columns` are the components of the state
-    that are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its
-    columns beyond those of `wrt` are directions of the start, and of the reference as far as it is
-    made of the tensors `of_signals`, one for each column."""
+    that are kept. The task's dy0 (size, n) is the derivative of the initial state, zero by default;
+    its columns beyond those of `wrt` are directions of the start, and of the reference as far as it
+    is made of the task's leaves, one for each column."""
+    stepper, t, dy0 = task.stepper, task.t, task.dy0
     size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wrt))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
-    dp = np.zeros((len(stepper.compiled.p), n))
-    dp[:, : len(wrt)] = directions(stepper.compiled.p, wrt)
-    kept, felt = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
+    dp = np.zeros((len(stepper.parameters.p), n))
+    dp[:, : len(wrt)] = directions(stepper.parameters.p, wrt)
+    kept, forces = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
     segments: list[Segment] = []
-    room = stepper.compiled.model.take(stepper.compiled.numbers)
-    work, tangents = (room.of(kind, columns=n) for kind in ("Work", "Tangents"))
-    for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):
+    room = stepper.parameters.model.take(stepper.parameters.numbers)
+    work, along = (room.of(kind, columns=n) for kind in ("Work", "Directions"))
+    growing = stepper.integrate(task.y0.detach(), t, segments, float("inf"), outputs_too=count > 0)
+    for out in growing:
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop(0)
             plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
             rows = np.empty((len(plan.out_step), size, n))
-            along = signal_directions(stepper, plan.stage_times.ravel(), of_signals, n)
+            dsignals = signal_directions(stepper, plan.stage_times.ravel(), task.leaves, n)
             sweep = Forward(
-                room.system, work, tangents, tape, plan.h, segment.stages, plan.out_step,
-                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, along, rows,
-                felt[segment.rows],
+                room.system, work, along, tape, plan.h, segment.stages, plan.out_step,
+                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, dsignals, rows,
+                forces[segment.rows],
             )  # fmt: skip
             with released_turn():
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
-        slopes = torch.from_numpy(kept), torch.from_numpy(felt)
-        yield Solved(stepper, y0, t, out, None, slopes)
-    stepper.compiled.model.give(room)
+        yield Solved(task, out, None, (torch.from_numpy(kept), torch.from_numpy(forces)))
+    stepper.parameters.model.give(room)
     rigid = [k for k, column in enumerate(columns) if column in set(stepper.layout.rigid)]
     own = np.array([float(p.detach()) for p in wrt])
     moved = np.abs(kept[:, rigid, : len(wrt)] * own).max((0, 2), initial=0.0)

@@ -27,7 +27,7 @@ from torchsoft.physics.contact import (
     slip_of,
     stored_law,
 )
-from torchsoft.physics.elements import CONSTANTS, CORNERS, element_potentials
+from torchsoft.physics.elements import Quadrilateral, element_potentials
 from torchsoft.physics.hyperelastic import Hyperelastic, invariants
 from torchsoft.physics.material import Material
 from torchsoft.physics.motion import Reference
@@ -404,11 +404,11 @@ def element_law(
     own = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
     parameters: dict[str, Tensor] = {f"material.{key}": value for key, value in own.items()}
     parameters["factors.values"] = factors
-    corners = CORNERS * fields
+    corners = Quadrilateral.dofs * fields
     try:
         law = compiled_law(
-            parameters, element, 2 * corners + CONSTANTS, corners, 2 * corners, conjugates=corners,
-            lanes=LANES, material=material, factors=Factors(factors),
+            parameters, element, 2 * corners + Quadrilateral.constants, corners, 2 * corners,
+            conjugates=corners, lanes=LANES, material=material, factors=Factors(factors),
         )  # fmt: skip
     except UnknownOperation as error:
         raise UnknownOperation(f"the material of the pad `{name}`: {error}") from error

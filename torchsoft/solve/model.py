@@ -16,17 +16,17 @@ from torch import Tensor
 
 from torchsoft.caller import warn
 from torchsoft.codegen import Law
-from torchsoft.physics.contact import Friction, SoftContact
-from torchsoft.physics.elements import CONSTANTS, CORNERS
-from torchsoft.physics.energy import Integrals
+from torchsoft.physics.channels import recorded_slices
+from torchsoft.physics.contact import SoftContact
+from torchsoft.physics.elements import Quadrilateral
+from torchsoft.physics.energy import integrals
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.rate_and_state import RateAndState
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Shape
-from torchsoft.physics.structure import Copies, Structure, structure_of
+from torchsoft.physics.structure import Structure, structure_of
 from torchsoft.physics.validity import (
     LARGEST,
     MISSING,
@@ -48,6 +48,7 @@ from torchsoft.solve.kernel.arrays import (
     Nodal,
     Pads,
     Points,
+    Ports,
     Sources,
     recorded_size,
     scratch,
@@ -75,9 +76,6 @@ HELD = 3e-4
 """Strain up to which the derivatives of an element's forces are held while it changes, in Newton's
 method."""
 
-NEGLIGIBLE = 1e-9
-"""Nodal force [N] below which a node counts as unloaded."""
-
 KEPT, KEPT_BYTES = 8, 5e7
 """Most models that are kept, and arrays of theirs [bytes] beyond the last one's."""
 
@@ -100,15 +98,34 @@ class Room:
 
 
 class Model:
-    """The model of a copy of a rig with parameters `values`, one for each of its structure.
+    """What the structure and the geometry of a rig determine, made of a copy of a rig with
+    parameters `values`, one for each of its structure; fixed from then on.
+
+    rig, structure: that copy and its structure, of which runs take copies of their own
+    layout: places of the parts of the state (size,)
+    recorded: places in the forces (recorded,) of an output, by kind and name
+    integrals: energies [J] that are integrated beside the state
+    signals, followed: names of the reference's signals; their number with fixed coordinates
+    places: places in the vector of parameters, by their names
+    index (m,): places in that vector of the numbers p that the kernels read
+    low, high (parameters,): least and largest values of the parameters, each in its unit
+    derived: numbers made of parameters, as number of a module, name and range; judged: numbers of
+        modules that judge their parameters together
+    errors: components of the state whose error is judged together
+    smallest: size of the smallest body [m]
+    widths: numbers of an output: of the state, of integrals, forces and rates of nodal pads
+    nodal_widths: numbers of rates of each nodal pad
+    bytes: size of the kernels' arrays; no_tape: a tape for nothing
+    shared: whether it may serve other runs
+    last, motion: vectors of parameters and signals of the last run, with what they were made of
 
     Raises the `ValueError`s of a rig that cannot be run, and warns of its laws' faults.
     """
 
     def __init__(self, structure: Structure, values: Sequence[Tensor]) -> None:
-        self.copies = Copies(structure)
-        modules = self.copies.made(values)
+        modules = structure.copy(values)
         self.rig: Rig = modules[0]
+        self.structure = Structure(self.rig)
         self.rig.check_names()
         check_values(self.rig)
         check_groups(self.rig)
@@ -120,7 +137,7 @@ class Model:
         self._geometry = self._geometry_of(values)
         self._read(values)
         self._idle: list[Room] = []
-        self.last: tuple[Array, Tensor, dict[str, float]] | None = None
+        self.last: tuple[Array, Tensor, Tensor, dict[str, float]] | None = None
         self.motion: tuple[Any, Followed] | None = None
 
     def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
@@ -153,9 +170,8 @@ class Model:
 
     def _read(self, values: Sequence[Tensor]) -> None:
         rig = self.rig
-        self.layout, self.integrals, self.signals = rig.layout, Integrals(rig), rig.signals
-        slices = self.layout.slices
-        self.condensed = {k: slices["pads", k] for k, pad in rig.pads.items() if not pad.nodal}
+        self.layout, self.integrals, self.signals = rig.layout, integrals(rig), rig.signals
+        self.recorded = recorded_slices(rig)
         self.followed = len(rig.signals) + len(rig.fixed_values)
         self.errors = ErrorParts(rig)
         self._known: dict[tuple[int, int], LawSet] = {}
@@ -167,18 +183,19 @@ class Model:
         for value in (*values, *self._made.values()):
             self._places.setdefault(id(value), count)
             count += value.numel()
+        self.places = self._named_places()
         self._bodies = self._make_bodies()
         self._pads = self._make_pads()
-        parts = self._bodies, self._make_sources(), self._pads, self._make_backs()
+        parts = (
+            self._bodies, self._make_ports(), self._make_sources(), self._pads, self._make_backs()
+        )  # fmt: skip
         self._condensed = self._make_condensed()
         self._parts = *parts, self._condensed, self._make_nodal(), *self._make_contacts()
         self.bytes = sum(np.asarray(one).nbytes for part in self._parts for one in part)
         self.index = torch.tensor(self._index, dtype=torch.int64)
-        self.nodal = {
+        self.nodal_widths = {
             name: 2 * pad.fields * pad.nodes for name, pad in rig.pads.items() if pad.nodal
         }
-        points = [2 * count for count in rig.point_counts.values()]
-        self.felt = [*points, 3 * len(rig.pads), 3 * len(rig.bodies) + 3]
         self._chains = [
             (at, n) for at, n in zip(self._condensed.chain_at, self._condensed.branches) if n
         ]
@@ -187,24 +204,19 @@ class Model:
         none = self.system(np.zeros(len(self._index)))
         self.no_tape = scratch("Tape", none, self.layout.size, stages=0, cap=0)
         self.widths = (
-            self.layout.size, len(self.integrals.names), recorded_size(none),
+            self.layout.size, len(rig.pads) + len(rig.actuators) + len(rig.bodies) + 4,
+            recorded_size(none),
             int(none.nodal_dof_start[-1]),
         )  # fmt: skip
         del self._made, self._places, self._shapes, self._matched, self._known, self._index
 
-    def displaced(self, p: Array, y: Array) -> dict[str, float]:
-        """Largest displacements of the loaded nodes of condensed pads [m] in states y (T, size)."""
-        own, out = self._condensed, dict[str, float]()
-        for name, here in self.condensed.items():
-            i = [*self.rig.pads].index(name)
-            at, n = own.chain_at[i], own.branches[i]
-            zeta = p[at : at + n] @ y[:, here].reshape(len(y), n, -1)
-            loaded = np.flatnonzero(np.abs(zeta).max(0) > NEGLIGIBLE) // 2 * 2
-            span = slice(*loaded[[0, -1]] + [0, 2]) if len(loaded) else slice(0)
-            C = own.C[own.C_start[i] : own.C_start[i + 1]].reshape(2 * (zeta.shape[1:]))
-            u = p[at + 2 * n] * (zeta[:, span] @ C[span, span])
-            out[name] = float(np.sqrt((u.reshape(len(y), -1, 2) ** 2).sum(-1).max(initial=0.0)))
-        return out
+    def _named_places(self) -> dict[str, slice]:
+        """Places of the parameters by all of their names, and of what is computed from them."""
+        named = dict(self.rig.named_parameters(remove_duplicate=False))
+        named |= {name: named[own] for name, own in self.rig.names.items() if own in named}
+        named |= {f"{kind} of {part}": value for (kind, part), value in self._made.items()}
+        firsts = {name: self._places[id(value)] for name, value in named.items()}
+        return {name: slice(at, at + named[name].numel()) for name, at in firsts.items()}
 
     def system(self, p: Array) -> Any:
         """The rig's arrays with the vector of parameters p."""
@@ -254,6 +266,23 @@ class Model:
             q_start=self._start("pose"), V_start=self._start("velocity"),
         )  # fmt: skip
 
+    def _make_ports(self) -> Ports:
+        """What laws of sources read."""
+        free, signal = self._bodies.free, self._bodies.signal
+        states = [
+            i for (of, _), s in self.layout.slices.items() if of == "control"
+            for i in range(s.start, s.stop)
+        ]  # fmt: skip
+        none, signals = np.full_like(free, -1), np.arange(2 * self.followed)
+        follows = [np.where(signal < 0, -1, 2 * signal + k) for k in (0, 1)]
+        join = lambda *parts: np.concatenate([np.full(len(signals), -1), *parts])
+        after = np.full(len(states), -1)
+        return filled(
+            Ports, y=join(np.where(free < 0, -1, self._bodies.q_start + free), none, states),
+            number=join(free, none, after),
+            signal=np.concatenate((signals, *follows, after)),
+        )  # fmt: skip
+
     def _make_pads(self) -> Pads:
         rig, slices, bodies = self.rig, self.layout.slices, list(self.rig.bodies)
         pads, sizes = rig.pads.values(), [len(pad.mesh.surface) for pad in rig.pads.values()]
@@ -264,8 +293,8 @@ class Model:
         columns = np.full((len(pads), len(self._bodies.coordinate)), -1, np.int64)
         for number, name in enumerate(rig.pads):
             touched = (3 * bodies.index(rig.contacts[key].body) for key in rig.contacts_of(name))
-            mine = np.isin(self._bodies.coordinate // 3 * 3, [base[number], *touched])
-            columns[number, mine] = np.arange(mine.sum())
+            involved = np.isin(self._bodies.coordinate // 3 * 3, [base[number], *touched])
+            columns[number, involved] = np.arange(involved.sum())
         ends = np.cumsum([0, *rig.point_counts.values()])
         owners = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
         return filled(
@@ -310,7 +339,7 @@ class Model:
         pads = [pad if pad.nodal else None for pad in rig.pads.values()]
         dofs = [0 if pad is None else 2 * pad.fields * pad.nodes for pad in pads]
         numbers = [None if pad is None else field_dofs(pad) for pad in pads]
-        band = [0 if dof is None else spread(dof) for dof in numbers]
+        band = [0 if dof is None else bandwidth(dof) for dof in numbers]
         fields = max((pad.fields for pad in rig.pads.values() if pad.nodal), default=1)
         elements = [0 if pad is None else -(-len(pad.corners) // LANES) * LANES for pad in pads]
         laws, starts, ends, density = list[Law | None](), list[int](), list[int](), list[int]()
@@ -341,17 +370,17 @@ class Model:
             density_at=density, hold=[HELD if isinstance(pad.material, Hyperelastic) else np.inf
                                       for pad in rig.pads.values()], band=band,
             band_start=np.cumsum([0, *(n * (2 * b + 1) for n, b in zip(dofs, band))])[:-1],
-            value=address("value"), linearise=address("linearise"), pullback=address("pullback"),
-            push=address("push"),
+            value=address("value"), linearise=address("linearise"), push=address("push"),
+            pull=address("pull"),
             p_first=starts, p_last=ends,
             X=joined(lambda pad: np.tile(pad.positions.numpy(), pad.fields).ravel()),
             area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2 * pad.fields)),
-            dof=np.concatenate([np.zeros((0, CORNERS * fields)), *(
-                filled_up(lengthened(dof, -1), CORNERS * fields) for dof in numbers
+            dof=np.concatenate([np.zeros((0, Quadrilateral.dofs * fields)), *(
+                filled_up(lengthened(dof, -1), Quadrilateral.dofs * fields) for dof in numbers
                 if dof is not None
             )]),
-            constants=joined(lambda pad: lengthened(pad.constants, 0.0), CONSTANTS),
-            surface=np.concatenate([np.zeros(0), *surface]),
+            constants=joined(lambda pad: lengthened(pad.constants, 0.0), Quadrilateral.constants),
+            surface=np.concatenate([np.zeros(0), *surface]), field=Quadrilateral.dofs,
         )  # fmt: skip
 
     def _make_sources(self) -> Sources:
@@ -367,20 +396,23 @@ class Model:
             laws.append(weight_law())
             starts.append(self._add(self._made["weight", name]))
         every, others = rig.actuators.values(), [[]] * len(rig.weighted)
-        signal_start, signal = _ragged(
-            [[rig.signals.index(name) for name in one.reads] for one in every] + others
-        )
-        coordinate_start, coordinate = _ragged(
-            [[rig.coordinate(name) for name in one.measures] for one in every] + others
-        )
+        first, count = 2 * self.followed, len(self._bodies.free)
+        inputs, states = [], first + 2 * count
+        for one in every:
+            read = [2 * rig.signals.index(name) + k for name in one.reads for k in (0, 1)]
+            read += [
+                first + rig.coordinate(name) + k * count for name in one.measures for k in (0, 1)
+            ]
+            inputs.append([*read, *range(states, states + len(one.states))])
+            states += len(one.states)
         return filled(
-            Sources, linearise=[law.linearise for law in laws],
-            pullback=[law.pullback for law in laws], p_start=[*starts, len(self._index)],
+            Sources, linearise=[law.linearise for law in laws], push=[law.push for law in laws],
+            pull=[law.pull for law in laws], p_start=[*starts, len(self._index)],
             pushed=[rig.coordinate(one.pushes) for one in every]
             + [rig.coordinate(f"{name}.y") for name in rig.weighted],
             power=[*range(len(every)), *[len(every)] * len(rig.weighted)],
-            signal_start=signal_start, signal=signal, coordinate_start=coordinate_start,
-            coordinate=coordinate, states=[len(one.states) for one in every] + [0] * len(others),
+            input_start=np.cumsum([0, *map(len, inputs + others)]), input=sum(inputs, list[int]()),
+            states=[len(one.states) for one in every] + [0] * len(others),
             y_start=[
                 self.layout.slices["control", name].start if one.states else 0
                 for name, one in rig.actuators.items()
@@ -393,7 +425,7 @@ class Model:
         if key not in self._known:
             check_shape(self.rig.contacts[name].body, shape)
             slip = law.friction
-            own = structure_of(law) is None or not isinstance(slip, Friction | RateAndState)
+            own = structure_of(law) is None or not type(slip).__module__.startswith("torchsoft.")
             stiffness = law.R_t.item() + NOMINAL * law.K_t.item()
             if own:
                 self.shared = False
@@ -433,9 +465,9 @@ class Model:
             states=[one.states for one in laws], distance=[one.distance.value for one in laws],
             value=[one.interface.value for one in laws],
             linearise=[one.interface.linearise for one in laws],
-            pullback=[one.interface.pullback for one in laws],
+            push=[one.interface.push for one in laws], pull=[one.interface.pull for one in laws],
             free_linearise=[one.free.linearise for one in laws],
-            free_pullback=[one.free.pullback for one in laws],
+            free_push=[one.free.push for one in laws], free_pull=[one.free.pull for one in laws],
             stored=[one.stored.value for one in laws], p_start=[*starts, len(self._index)],
             point_start=np.cumsum([0, *counts]), size=[shape.size() for shape in shapes],
             inner=[shape.deepest() for shape in shapes], limits=limits, relative=motion_law().value,
@@ -476,7 +508,7 @@ def filled_up(rows: Index, width: int) -> Index:
     return np.pad(rows, ((0, 0), (0, width - rows.shape[1])), constant_values=-1)
 
 
-def spread(corners: Index) -> int:
+def bandwidth(corners: Index) -> int:
     """Largest difference between the dofs of one element, bonded ones (below zero) apart."""
     free = corners >= 0
     most = np.where(free, corners, -1).max(1) - np.where(free, corners, corners.max()).min(1)
@@ -490,11 +522,6 @@ def filled(part: Any, /, **fields: Any) -> Any:
         value = np.ascontiguousarray(fields[name], dtype) if ndim else fields[name]
         parts.append(value if np.ndim(value) == ndim else value.reshape((0,) * ndim))
     return part(*parts)
-
-
-def _ragged(lists: list[list[int]]) -> tuple[Index, list[int]]:
-    """Ends of concatenated lists, and their numbers."""
-    return np.cumsum([0, *map(len, lists)]), [number for one in lists for number in one]
 
 
 def prepared_shapes(rig: Rig) -> dict[str, Shape]:

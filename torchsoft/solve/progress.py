@@ -22,12 +22,28 @@ class SimulationFailed(RuntimeError):
 
 
 @dataclass
+class Stats:
+    """Statistics of a run: steps, linear solves (Newton iterations), steps that Newton did not
+    solve and that were shortened, steps rejected for their error, and wall time [s]."""
+
+    steps: int
+    newton_iterations: int
+    failed_steps: int
+    refused_steps: int
+    wall_s: float
+
+    @property
+    def newton_per_step(self) -> float:
+        return self.newton_iterations / max(self.steps, 1)
+
+
+@dataclass
 class Progress:
     """Results of the stepper so far: rows of the output grid, its steps, and its counters.
 
-    integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them; rate: of
-    the displacements of nodal pads [m/s]; signals: values and rates, fixed coordinates last;
-    stored: energy [J], nan with nodal pads.
+    integrals: energies [J], as `physics.energy.integrals` numbers them; recorded: forces, as
+    `recorded_slices` orders them; rate: of the displacements of nodal pads [m/s]; signals: values
+    and rates, fixed coordinates last; stored: energy [J], nan with nodal pads.
     """
 
     y: Array
@@ -37,10 +53,7 @@ class Progress:
     signals: Array
     stored: Array
     rows: int = 0
-    steps: int = 0
-    solves: int = 0
-    failed: int = 0
-    refused: int = 0
+    stats: Stats = field(default_factory=lambda: Stats(0, 0, 0, 0, 0.0))
     starts: list[Array] = field(default_factory=list)
     end: float = 0.0
     origin: float = 0.0
@@ -54,7 +67,7 @@ class Progress:
     def knots(self) -> Array:
         """Times of the steps' begins and ends [s] (steps + 1,); empty without steps. Of steps
         below the float64 resolution of their times one is left."""
-        since = np.concatenate([*self.starts, np.full(min(self.steps, 1), self.end)])
+        since = np.concatenate([*self.starts, np.full(min(self.stats.steps, 1), self.end)])
         return since if self.origin == 0 else np.unique(self.origin + since)
 
 

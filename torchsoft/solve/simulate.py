@@ -2,12 +2,9 @@
 `Trajectory`."""
 
 import time as clock
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property
-from importlib.metadata import version
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm import tqdm
@@ -15,29 +12,25 @@ from tqdm import tqdm
 from torchsoft.caller import warn
 from torchsoft.parallel import one_torch_thread, ungraphed
 from torchsoft.physics.arguments import Numbers, positive, tensor
-from torchsoft.physics.channels import Seen, read, units
-from torchsoft.physics.energy import stored
+from torchsoft.physics.channels import Touch
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.setup import Setup
-from torchsoft.physics.state import State
-from torchsoft.physics.structure import Copies, Structure
+from torchsoft.physics.structure import Structure
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.diagnostics import doubts, instability
 from torchsoft.solve.gradients import (
     TAPE_BYTES,
-    Rows,
+    Route,
     Solved,
-    attached,
+    Task,
     directions,
     iterate,
     march,
-    without_gradient,
 )
-from torchsoft.solve.progress import Progress, SimulationFailed
-from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.solve.system import independent
-from torchsoft.solve.trajectory import Ledger, Stats, Touch, Trajectory
+from torchsoft.solve.parameters import independent
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.solve.trajectory import Trajectory
 
 
 class Initial(NamedTuple):
@@ -49,11 +42,6 @@ class Initial(NamedTuple):
 
 Start = Callable[[Rig], Initial]
 """Start of a run as a function of the rig, differentiable in the rig's parameters."""
-
-Route = Literal["none", "discrete", "forward"]
-"""Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`."""
-
-VERSION = version("torchsoft")
 
 RTOL = 1e-5
 """Relative tolerance where nothing else is asked for."""
@@ -108,7 +96,7 @@ def simulate(
         rig, t, y0=y0, reference=reference, rtol=rtol, atol=atol, step=step, knots=knots,
         tolerance=tolerance, gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid, touch=touch,
     )  # fmt: skip
-    trajectory = run(task, TAPE_BYTES, progress).trajectory()
+    trajectory = Trajectory.of(run(task, TAPE_BYTES, progress))
     for doubt in doubts(trajectory, task.stepper.rig).values():
         warn(doubt)
     return trajectory
@@ -118,24 +106,7 @@ def simulate(
 @one_torch_thread()
 def unjudged(rig: Rig, t: Numbers, **options: Any) -> Trajectory:
     """`simulate` without its warnings, for searches whose runs on the way need none."""
-    return run(prepare(rig, t, **options), TAPE_BYTES).trajectory()
-
-
-class Task(NamedTuple):
-    """A run that may begin: the arguments of `simulate`, checked. The stepper has a snapshot of the
-    `rig`."""
-
-    stepper: ImplicitStepper
-    t: Tensor
-    y0: Tensor
-    gradient: Route
-    wrt: tuple[str, ...]
-    dy0: Tensor | None
-    rigid: bool
-    touch: tuple[str, ...]
-    rig: Rig | None = None
-    leaves: tuple[Tensor, ...] = ()
-    """The parameters `wrt`, and more tensors, of which the start and the reference were made."""
+    return Trajectory.of(run(prepare(rig, t, **options), TAPE_BYTES))
 
 
 def prepare(
@@ -189,9 +160,9 @@ def prepare(
         or (gradient == "discrete" and torch.is_grad_enabled()),
     )
     stepper.check(start, t)
-    felt = _channels_of_touch(rig, touch)
     return Task(
-        stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid, felt, rig,
+        stepper, t, shared(start), gradient, tuple(map(rig.full, wrt)), dy0, rigid,
+        _channels_of_touch(rig, touch), rig,
         (*leaves, *more),
     )  # fmt: skip
 
@@ -205,53 +176,22 @@ def started(
     if values:
         structure = structure or Structure(rig)
         given = [values.get(id(x), x) for x in structure.parameters]
-        rig = Copies(structure).made(given)[0]
+        rig = structure.copy(given)[0]
     wanted = gradient == "forward" or (gradient == "discrete" and torch.is_grad_enabled())
     with torch.set_grad_enabled(wanted), independent():
         return start(rig)
 
 
-class RunOutcome(NamedTuple):
-    """A finished run, with the tape to differentiate it, and its time [s]."""
-
-    task: Task
-    solved: Solved
-    wall: float
-
-    def trajectory(self, rows: Rows | None = None) -> Trajectory:
-        """The trajectory of the rows that the stepper has finished, by default with the adjoint of
-        this run behind them. What is made of them is made when it is asked for; at once where code
-        of users makes it, which may do otherwise later."""
-        task, out, slopes = self.task, self.solved.out, self.solved.slopes
-        rows = attached([self.solved])[0] if rows is None else rows
-        stepper, count = task.stepper, out.rows
-        model, (y, felt) = stepper.compiled.model, (part[:count] for part in rows)
-        rest, touch = _Rest(stepper, task.t[:count], y, felt, out), Touch(stepper.rig)
-        own: dict[str, Any] = {"sensitivities": None, "touch_sensitivities": {}}
-        if slopes is not None:
-            of_touch = touch.slopes(task.touch, slopes[1][:count], felt).unbind(1)
-            own = {"sensitivities": slopes[0][:count]}
-            own["touch_sensitivities"] = dict(zip(task.touch, of_touch))
-        made = Trajectory.later(
-            rest, t=rest.t, y=y, recorded=felt, touch=touch, layout=model.layout, wrt=task.wrt,
-            stats=Stats(out.steps, out.solves, out.failed, out.refused, self.wall),
-            rig=task.rig or stepper.rig, **own,
-        )  # fmt: skip
-        if not model.shared or not stepper.followed.known:
-            made.complete()
-        return made
-
-
 def run(
     task: Task, tape_bytes: float, progress: bool = False, explained: bool = True,
     effort: float = float("inf"),
-) -> RunOutcome:  # fmt: skip
+) -> Solved:  # fmt: skip
     """Carry out a task by one of the compiled routes; `explained` looks for the cause of a failure,
     which takes seconds. The run stops early after an `effort` of so many Newton iterations.
 
     Raises `SimulationFailed` and `Interrupted` with the run so far.
     """
-    stepper, t, bar = task.stepper, task.t, None
+    t, bar = task.t, None
     if progress:
         bar = tqdm(
             total=float(t[-1] - t[0]),
@@ -264,25 +204,25 @@ def run(
         with torch.set_grad_enabled(
             task.gradient == "forward" or (task.gradient == "discrete" and torch.is_grad_enabled())
         ):
-            for solved in _growing(task, tape_bytes):
-                done = RunOutcome(task, solved, clock.perf_counter() - began)
+            for done in _growing(task, tape_bytes):
+                stats = done.out.stats
+                stats.wall_s = clock.perf_counter() - began
                 if bar is not None and not bar.disable:
-                    bar.n = float(t[solved.out.rows - 1] - t[0])
+                    bar.n = float(t[done.out.rows - 1] - t[0])
                     bar.refresh()
-                if solved.out.solves > effort:
+                if stats.newton_iterations > effort:
                     break
     except SimulationFailed as failure:
         if done is None:
             raise
-        so_far = done.trajectory(done.solved.rows)
+        failure.trajectory = Trajectory.of(done, done.rows)
         if explained:
-            raise diagnose(stepper.rig, failure, so_far) from None
-        failure.trajectory = so_far
+            raise diagnose(task.stepper.rig, failure) from None
         raise
     except KeyboardInterrupt:
         if done is None:
             raise
-        raise Interrupted(done.trajectory(done.solved.rows)) from None
+        raise Interrupted(Trajectory.of(done, done.rows)) from None
     finally:
         if bar is not None:
             bar.close()
@@ -334,7 +274,7 @@ def _growing(task: Task, tape_bytes: float) -> Iterator[Solved]:
     """The growing run."""
     stepper, wrt, dy0 = task.stepper, task.wrt, task.dy0
     if task.gradient != "forward":
-        return march(stepper, task.y0, task.t, tape_bytes)
+        return march(task, tape_bytes)
     leaves = [stepper.rig.parameter(name) for name in wrt]
     for name, value in zip(wrt, leaves):
         if value.ndim or not value.requires_grad:
@@ -350,130 +290,20 @@ def _growing(task: Task, tape_bytes: float) -> Iterator[Solved]:
         if not bool(torch.isfinite(dy0).all()):
             raise ValueError("`dy0` must be finite, but has a component that is not")
     kept = stepper.layout.measured if task.rigid else list(range(size))
-    sums = Touch(stepper.rig).sums(task.touch)
-    return iterate(stepper, task.y0, task.t, leaves, dy0, kept, sums, task.leaves)
+    return iterate(task, leaves, kept, Touch(stepper.rig).sums(task.touch))
 
 
-def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
-    """The failure with the run so far, and with the closed loop's instability as its cause if the
-    loop is unstable."""
-    cause = instability(rig, trajectory)
+def diagnose(rig: Rig, failure: SimulationFailed) -> SimulationFailed:
+    """The failure, with the closed loop's instability as its cause if the loop is unstable."""
+    cause = instability(rig, failure.trajectory)
     reason = (
         f"the run was lost at t = {failure.time:.4f} s: {cause} (it ended with: {failure})"
         if cause
         else str(failure)
     )
     out = SimulationFailed(reason, failure.time, failure.contact, failure.left)
-    out.trajectory = trajectory
+    out.trajectory = failure.trajectory
     return out
-
-
-class _Rest:
-    """Parts of a trajectory that are made of the rows of a run, and of the rig of the run."""
-
-    def __init__(
-        self, stepper: ImplicitStepper, t: Tensor, y: Tensor, felt: Tensor, out: Progress
-    ) -> None:
-        self._rig, self._reference, self._motion = stepper.rig, stepper.reference, stepper.followed
-        self._compiled, self._out, self.t, self._y = stepper.compiled, out, t, y
-        given = (
-            "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
-        )
-        tolerances = {"rtol": stepper.rtol, "atol": stepper.atol}
-        self._steps = {given: stepper.step} if given else tolerances
-        self._model, self._felt, self._count = stepper.compiled.model, felt, len(y)
-
-    @property
-    def ledger(self) -> Ledger | None:
-        """What the run is judged by; None with nodal pads, whose energies the kernel does not
-        know."""
-        model, out, names = self._model, self._out, self._model.integrals
-        if model.nodal:
-            return None
-        integrals, ends = out.integrals[: self._count], len(names.dissipated)
-        felt = self._felt.detach().numpy()[:, : sum(model.felt[:-2])]
-        force = (felt**2).reshape(self._count, -1, 2).sum(-1).max(initial=0.0)
-        return Ledger(
-            out.stored[: self._count], names.dissipated, integrals[:, :ends],
-            integrals[:, ends:-1].sum(1), float(integrals[-1, -1]), float(np.sqrt(force)),
-            model.displaced(self._compiled.numbers, out.y[: self._count]), self._steps,
-        )  # fmt: skip
-
-    @cached_property
-    def knots(self) -> Tensor:
-        return torch.from_numpy(self._out.knots)
-
-    @cached_property
-    def _parts(self) -> tuple[Tensor, ...]:
-        return self._felt.split(self._model.felt, -1)
-
-    @cached_property
-    def force(self) -> dict[str, Tensor]:
-        return {k: x.unflatten(-1, (-1, 2)) for k, x in zip(self._model.rig.contacts, self._parts)}
-
-    @cached_property
-    def loads(self) -> dict[str, Tensor]:
-        return dict(zip(self._model.rig.bodies, self._parts[-1].unflatten(-1, (-1, 3)).unbind(1)))
-
-    @cached_property
-    def rates(self) -> dict[str, Tensor]:
-        nodal = self._model.nodal
-        parts = torch.from_numpy(self._out.rate[: self._count]).split([*nodal.values()], -1)
-        pads = self._model.rig.pads
-        return {name: x.unflatten(-1, (pads[name].nodes, -1)) for name, x in zip(nodal, parts)}
-
-    def _integrals(self, names: Iterable[str]) -> dict[str, Tensor]:
-        every, rows = self._model.integrals.names, torch.from_numpy(self._out.integrals)
-        found = {name: rows[: self._count, every.index(name)] for name in names}
-        return {name: without_gradient(name, x, self._y) for name, x in found.items()}
-
-    @cached_property
-    def dissipated(self) -> dict[str, Tensor]:
-        return self._integrals(self._model.integrals.dissipated)
-
-    @cached_property
-    def supplied(self) -> dict[str, Tensor]:
-        return self._integrals(self._model.integrals.active)
-
-    @cached_property
-    def injected(self) -> Tensor:
-        return self._integrals(["injected"])["injected"]
-
-    @cached_property
-    def _followed(self) -> Tensor:
-        """The signals at the outputs, with their graph where there is one."""
-        known = None if self._y.requires_grad else self._motion.at(self.t)
-        return self._rig.follow(self.t, self._reference) if known is None else known
-
-    @cached_property
-    def state(self) -> State:
-        return self._rig.unpack(self._y, self._followed)
-
-    @cached_property
-    def channels(self) -> dict[str, Tensor]:
-        moments = dict(zip(self._rig.pads, self._parts[-2][:, 2::3].unbind(-1)))
-        return read(Seen(self._rig, self.state, self._followed, moments))
-
-    @cached_property
-    def displacement(self) -> dict[str, Tensor]:
-        return {name: self._rig.displacement(name, self.state) for name in self._rig.pads}
-
-    @cached_property
-    def energy(self) -> dict[str, Tensor]:
-        return stored(self._rig, self.state, self.displacement)
-
-    @cached_property
-    def made_by(self) -> dict[str, Any]:
-        made = {"torchsoft": VERSION, "method": METHOD}
-        return {**made, **self._rig.description(), "steps": self._steps}
-
-    @cached_property
-    def units(self) -> dict[str, str]:
-        return units(self._rig)
-
-    @cached_property
-    def setup(self) -> Setup:
-        return Setup.of(self._rig)
 
 
 # Inputs of a run: numbers in any usual form, and a start whose graph may be shared.

@@ -34,6 +34,7 @@ from torchsoft.solve.kernel.arrays import (
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.laws import reference_fault
+from torchsoft.solve.parameters import Parameters
 from torchsoft.solve.progress import Progress, RunState, Segment, SimulationFailed
 from torchsoft.solve.steps import (
     LONGEST,
@@ -44,7 +45,6 @@ from torchsoft.solve.steps import (
     equal_steps,
     given_steps,
 )
-from torchsoft.solve.system import Compiled
 
 HALVINGS = 6
 """Most halvings of a step that Newton does not solve before the run fails."""
@@ -106,16 +106,16 @@ class ImplicitStepper:
         self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
         self.knots = None if knots is None else check_knots(knots)
-        self.compiled = Compiled(
+        self.parameters = Parameters(
             rig, reference, structure=structure, values=values, differentiable=differentiable
         )
-        self.rig, self.reference = self.compiled.rig, self.compiled.reference
-        if self.tolerance < (least := SMALLEST_TOLERANCE * self.compiled.units["force"]):
+        self.rig, self.reference = self.parameters.rig, self.parameters.reference
+        if self.tolerance < (least := SMALLEST_TOLERANCE * self.parameters.units["force"]):
             raise ValueError(
                 f"`tolerance` must be at least {least:.3g} N, but is {tolerance:g} N, "
                 "which rounding hides"
             )
-        self.layout, self.integrals = self.compiled.layout, self.compiled.model.integrals
+        self.layout = self.parameters.layout
         self.origin = 0.0
         self._motion: Followed | None = None
         self._cap, self._shortest = 64, SHORTEST
@@ -144,7 +144,7 @@ class ImplicitStepper:
 
     def signals_at(self, times: Tensor | Array) -> Tensor:
         """The signals at times (...) [s] since the origin (..., signals, 2)."""
-        return self.compiled.signals(torch.as_tensor(times), self.reference.since(self.origin))
+        return self.parameters.signals(torch.as_tensor(times), self.reference.since(self.origin))
 
     def signals_now(self, t: Tensor) -> Tensor:
         """The signals at t [s] of the last run, without fixed coordinates (..., signals, 2)."""
@@ -154,7 +154,7 @@ class ImplicitStepper:
     @property
     def signals_at_start(self) -> Tensor:
         """The signals at one moment, to see whether they carry a graph."""
-        return self.compiled.signals(torch.zeros(1, dtype=torch.float64), self.reference)
+        return self.parameters.signals(torch.zeros(1, dtype=torch.float64), self.reference)
 
     def check(self, y0: Tensor, t: Tensor) -> None:
         """Raises `ValueError` unless a run can go from y0, one finite state of this rig, through
@@ -170,7 +170,7 @@ class ImplicitStepper:
         if not (finite := np.isfinite(y0.detach().numpy())).all():
             first = np.flatnonzero(~finite)[0]
             raise ValueError(f"`y0` must be finite, but component {first} is not")
-        if self.reference.plain(self.rig.signals) is None and (
+        if not self.reference.is_plain(self.rig.signals) and (
             wrong := reference_fault(self.reference, self.rig.signals, t)
         ):
             warn(wrong)
@@ -188,9 +188,9 @@ class ImplicitStepper:
         pass. Raises `SimulationFailed`.
         """
         self.origin, times = float(t[0]), t.numpy() - float(t[0])
-        self.followed = self._motion or self.compiled.followed(self.reference, self.origin)
+        self.followed = self._motion or self.parameters.followed(self.reference, self.origin)
         self._shortest = min(SHORTEST, PART * times[-1])
-        room, out = self.compiled.model.take(self.compiled.numbers), self._progress(len(t))
+        room, out = self.parameters.model.take(self.parameters.numbers), self._progress(len(t))
         now = RunState(room, y0.numpy().copy(), out, segments, tape_bytes, outputs_too)
         given = self.step is not None or self.knots is not None
         table = self._table(now, times, given)
@@ -204,15 +204,20 @@ class ImplicitStepper:
             if not out.rows and not np.isfinite(out.signals[0]).all():
                 self.signals_at(np.zeros(1))  # which raises
             rows = slice(out.rows, out.rows + done)
-            out.rows, out.steps, out.solves = rows.stop, out.steps + steps, out.solves + solves
-            out.refused, out.failed = out.refused + refused, out.failed + failed
+            out.rows, stats = rows.stop, out.stats
+            stats.steps, stats.newton_iterations = (
+                stats.steps + steps,
+                stats.newton_iterations + solves,
+            )
+            stats.refused_steps += refused
+            stats.failed_steps += failed
             now.keep(plan.taken(steps, done), rows, before, tapes)
             if out.rows:
                 yield out
             if status == TAPE_FULL:
                 self._cap *= 2
             elif status == NEWTON_FAILED and given and out.rows and halvings < HALVINGS:
-                out.failed += 1
+                stats.failed_steps += 1
                 room.work.u_dot[:], room.work.rate[:] = 0.0, 0.0
                 ends = int(np.searchsorted(plan.out_step, steps, side="right"))
                 todo.append((plan.left(steps + 1, ends), halvings))
@@ -226,14 +231,16 @@ class ImplicitStepper:
                 elif given:
                     since, h = float(plan.starts[steps]), float(plan.h[steps])
                 elif status < OFF_THE_PAD:
-                    names = self.compiled.model.errors.names
+                    names = self.parameters.model.errors.names
                     worst = names[which] if which >= 0 else "the state"
                 raise self._failure(status, since, h, which, worst)
             if not given and out.rows < len(t):
                 todo.append((self._blank(now, out.rows), 0))
             elif given and steps < len(plan.h):
                 todo.append((plan.left(steps, done), halvings))
-        self.compiled.model.give(room)  # not after a failure, which may leave numbers that are none
+        self.parameters.model.give(
+            room
+        )  # not after a failure, which may leave numbers that are none
 
     def _blank(self, now: RunState, row: int) -> Plan:
         """Room for steps that tolerances choose, and for the outputs from `row` on."""
@@ -271,7 +278,7 @@ class ImplicitStepper:
         room, followed, size = now.room, self.followed, self.layout.size
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > 0.0) & (stops <= times[-1])]
-        errors = self.compiled.model.errors.of(now.y, self.atol, self.compiled.units)
+        errors = self.parameters.model.errors.of(now.y, self.atol, self.parameters.units)
         clock = np.array([0.0, min(FIRST, times[-1]), 1.0])
         integrals, (starts, h, signals) = np.zeros(now.out.integrals.shape[1]), room.chunk
         nothing: Any = None
@@ -286,7 +293,7 @@ class ImplicitStepper:
     ) -> tuple[list[int], tuple[Any, Any] | None]:
         """One call of the compiled run, which goes on with its rows: its counts, and the tapes of
         its stages and outputs with `taping`."""
-        model, done, count = self.compiled.model, now.out.rows, len(plan.out_step)
+        model, done, count = self.parameters.model, now.out.rows, len(plan.out_step)
         y, integrals, recorded, rate, signals, stored = now.out.part(slice(done, done + count))
         tape = out_tape = model.no_tape
         if now.taping:
@@ -307,9 +314,9 @@ class ImplicitStepper:
 
     def _progress(self, rows: int) -> Progress:
         """Room for so many outputs."""
-        widths = self.compiled.model.widths
+        widths = self.parameters.model.widths
         y, integrals, recorded, rate = (np.zeros((rows, width)) for width in widths)
-        signals = np.zeros((rows, self.compiled.model.followed, 2))
+        signals = np.zeros((rows, self.parameters.model.followed, 2))
         return Progress(y, integrals, recorded, rate, signals, np.zeros(rows), origin=self.origin)
 
     def tapes(self, segment: Segment, room: Any) -> tuple[Any, Any]:

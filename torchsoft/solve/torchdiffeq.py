@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchsoft.parallel import cores, parallel_map
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.gradients import Solved, attached, march, run_adjoint
+from torchsoft.solve.gradients import Solved, Task, attached, march, run_adjoint
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
@@ -109,11 +109,11 @@ class TorchdiffeqSolver:
             self.stepper.check(sample.detach(), t)
 
         def run(i: int) -> Solved:
-            return deque(march(copy(self.stepper), samples[i], t), maxlen=1)[0]
+            return deque(march(Task(copy(self.stepper), t, samples[i])), maxlen=1)[0]
 
         for i, solved in parallel_map(run, len(samples)):
             runs[i] = solved
-        solution = torch.stack([rows.y for rows in attached(runs, cores())], 1)
+        solution = torch.stack([y for y, _ in attached(runs, cores())], 1)
         knots = [solved.out.knots for solved in runs]
         _runs.setdefault(self.model, deque(maxlen=REMEMBERED)).append(
             _Run(t.detach().clone(), solution.detach(), knots)
@@ -135,13 +135,13 @@ class TorchdiffeqSolver:
             *_, out = again.integrate(
                 y_start[sample], interval, segments, float("inf"), outputs_too=False
             )
-            run = Solved(again, y_start[sample], interval, out, segments)
+            run = Solved(Task(again, interval, y_start[sample]), out, segments)
             outputs = torch.stack((torch.zeros_like(y_bars[sample]), y_bars[sample]))
             y_bars[sample], *cotangents = run_adjoint(run, outputs, None)
             if parameters:
                 with torch.enable_grad():
                     times = np.concatenate([one.plan.stage_times.ravel() for one in segments])
-                    made_of = again.compiled.p, again.signals_at(times)
+                    made_of = again.parameters.p, again.signals_at(times)
                     value = torch.cat(
                         [(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]
                     ).sum()

@@ -3,68 +3,62 @@ their origin."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
+from functools import cached_property, wraps
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from torchsoft.display import Film, Shown, amount, suggestion
-from torchsoft.physics.energy import contact_states
-from torchsoft.physics.names import FORCES, ON_BODY
+from torchsoft.physics.channels import Seen, Touch, read, units
+from torchsoft.physics.energy import contact_states, stored
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import Layout, State
+from torchsoft.solve.gradients import Solved, attached, without_gradient
+from torchsoft.solve.parameters import independent
+from torchsoft.solve.progress import Progress, Stats
+from torchsoft.solve.stepper import METHOD, ImplicitStepper
+from torchsoft.solve.steps import Followed
 
 if TYPE_CHECKING:  # these take as long to import as all of this package
     import pandas as pd
     import xarray as xr
     from matplotlib.figure import Figure
-from typing import NamedTuple
 
-import numpy as np
-from scipy import sparse
+VERSION = version("torchsoft")
 
-from torchsoft.display import enumerated
-from torchsoft.solve.kernel.table import Array, Index
-from torchsoft.solve.system import independent
+V = TypeVar("V")
 
 
-@dataclass(frozen=True)
-class Stats:
-    """Statistics of a run: steps, linear solves (Newton iterations), steps that Newton did not
-    solve and that were shortened, steps rejected for their error, and wall time [s]."""
+def later(make: Callable[[Any], V]) -> cached_property[V]:
+    """A part of a trajectory that is made when it is first asked for, with a graph if the states
+    have one."""
 
-    steps: int
-    newton_iterations: int
-    failed_steps: int
-    refused_steps: int
-    wall_s: float
+    @wraps(make)
+    def made(run: Trajectory) -> V:
+        graph = run.y.requires_grad
+        apart = independent() if graph else nullcontext()
+        with torch.inference_mode(False), torch.set_grad_enabled(graph), apart:
+            return make(run)
 
-    @property
-    def newton_per_step(self) -> float:
-        return self.newton_iterations / max(self.steps, 1)
+    return cached_property(made)
 
 
-@dataclass(frozen=True, repr=False)
 class Trajectory(Shown):
     """A run sampled at t (T,) [s]. SI units, every tensor float64 and shaped (T, ...).
 
-    y: flat states (T, size). channels: measurable or requested series, by key, (T,) each. force:
-    normal and friction force (T, points, 2) [N] on the points of each contact, along n and t of
-    their moving frames. recorded (T, recorded): all forces, of which `touch` makes its channels,
-    `run["skin.normal.7"]`; both None in a run that was loaded. loads: those of contacts and pads on
-    each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement: of
-    the nodes of each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated,
-    supplied and `injected` [J] since t[0].
-
-    units: of the channels, by key, as far as the rig knows them.
+    y: flat states (T, size). recorded (T, recorded): all forces, in the order of
+    `recorded_slices`, of which `touch` makes its channels, `run["skin.normal.7"]`; both None in a
+    run that was loaded. units: of the channels, by key, as far as the rig knows them.
 
     setup: meshes, outlines, contacts and actuators as they were, for pictures and files; rig: the
-    rig of the run, None in a run that was loaded.
+    rig of the run, None in a run that was loaded. made_by: the versions, the rig's description and
+    the choice of steps.
 
     knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the
     same ones.
@@ -76,61 +70,172 @@ class Trajectory(Shown):
 
     t: Tensor
     y: Tensor
-    state: State = field(repr=False)
-    channels: dict[str, Tensor] = field(repr=False)
-    force: dict[str, Tensor] = field(repr=False)
-    loads: dict[str, Tensor] = field(repr=False)
-    displacement: dict[str, Tensor] = field(repr=False)
-    energy: dict[str, Tensor] = field(repr=False)
-    dissipated: dict[str, Tensor] = field(repr=False)
-    supplied: dict[str, Tensor] = field(repr=False)
-    injected: Tensor = field(repr=False)
     stats: Stats
-    knots: Tensor = field(repr=False)
-    layout: Layout = field(repr=False)
-    made_by: dict[str, Any] = field(repr=False)
+    layout: Layout
     wrt: tuple[str, ...] = ()
-    sensitivities: Tensor | None = field(default=None, repr=False)
-    touch_sensitivities: dict[str, Tensor] = field(default_factory=dict, repr=False)
-    units: dict[str, str] = field(default_factory=dict, repr=False)
-    setup: Setup = field(default_factory=Setup, repr=False)
-    rig: Rig | None = field(default=None, repr=False, compare=False)
-    recorded: Tensor | None = field(default=None, repr=False)
-    rates: dict[str, Tensor] = field(default_factory=dict, repr=False)
-    touch: Touch | None = field(default=None, repr=False)
-    known_contact_state: dict[str, Tensor] | None = field(default=None, repr=False, compare=False)
+    sensitivities: Tensor | None = None
+    touch_sensitivities: dict[str, Tensor]
+    recorded: Tensor | None = None
+    touch: Touch | None = None
+    rig: Rig | None = None
+    _out: Progress
+    _stepper: ImplicitStepper
+    _motion: Followed
+
+    def __init__(self, **known: Any) -> None:
+        """A run all of whose parts are known, as those of one in a file."""
+        vars(self).update(known)
 
     @classmethod
-    def later(cls, rest: Any, **known: Any) -> Trajectory:
-        """A run of whose fields only some are known yet; `rest` has the others as attributes, which
-        it makes when they are asked for."""
-        run = object.__new__(cls)
-        vars(run).update(known, known_contact_state=None, _rest=rest)
+    def of(cls, solved: Solved, rows: tuple[Tensor, Tensor] | None = None) -> Trajectory:
+        """The run of the `rows` that the stepper has finished, by default with the adjoint of this
+        run behind them. What is made of them is made when it is asked for; at once where code of
+        users makes it, which may do otherwise later."""
+        task, out = solved.task, solved.out
+        y, recorded = (part[: out.rows] for part in rows or attached([solved])[0])
+        run = cls(
+            t=task.t[: out.rows], y=y, recorded=recorded, stats=out.stats, wrt=task.wrt,
+            layout=task.stepper.layout, rig=task.rig or task.stepper.rig,
+            touch=(touch := Touch(task.stepper.rig)), touch_sensitivities={},
+        )  # fmt: skip
+        run._out, run._stepper, run._motion = out, task.stepper, task.stepper.followed
+        if solved.slopes is not None:
+            of_states, of_sums = (part[: out.rows] for part in solved.slopes)
+            run.sensitivities = of_states
+            of_touch = touch.slopes(task.touch, of_sums, recorded).unbind(1)
+            run.touch_sensitivities = dict(zip(task.touch, of_touch))
+        if not task.stepper.parameters.model.shared or not run._motion.known:
+            run.complete()
         return run
 
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """A field that was not known yet."""
-            own = vars(self)
-            if name not in type(self).__dataclass_fields__ or "_rest" not in own:
-                raise AttributeError(name)
-            with (
-                torch.inference_mode(False),
-                torch.set_grad_enabled(own["y"].requires_grad),
-                independent(),
-            ):
-                return own.setdefault(name, getattr(own["_rest"], name))
-
     def complete(self) -> None:
-        """Make everything that was not known yet."""
-        for name in type(self).__dataclass_fields__:
-            getattr(self, name)
-        vars(self).pop("_rest", None)
+        """Make everything that is to be made, but the states of contact points."""
+        for name, part in vars(Trajectory).items():
+            if isinstance(part, cached_property) and name != "contact_state":
+                getattr(self, name)
 
     def __getstate__(self) -> dict[str, Any]:
         self.complete()
-        return vars(self)
+        _ = self.contact_state
+        return {name: part for name, part in vars(self).items() if name[0] != "_"}
+
+    @later
+    def state(self) -> State:
+        """The states' parts, by name."""
+        return self._stepper.rig.unpack(self.y, self._signals)
+
+    @later
+    def channels(self) -> dict[str, Tensor]:
+        """Series of coordinates, signals, efforts and moments, by key (T,)."""
+        return read(Seen(self._stepper.rig, self.state, self._signals, self.recorded))
+
+    @later
+    def force(self) -> dict[str, Tensor]:
+        """Normal and friction force (T, points, 2) [N] on the points of each contact, along n and t
+        of their moving frames."""
+        return {k: x.unflatten(-1, (-1, 2)) for k, x in self._recorded_of("contact").items()}
+
+    @later
+    def loads(self) -> dict[str, Tensor]:
+        """Loads of contacts and pads on each body (T, 3), a force [N] and a moment about its centre
+        [N.m], world axes."""
+        return self._recorded_of("body")
+
+    @later
+    def displacement(self) -> dict[str, Tensor]:
+        """Displacements of the nodes of each pad (T, nodes, 2) [m], in its base's frame."""
+        rig = self._stepper.rig
+        return {name: rig.displacement(name, self.state) for name in rig.pads}
+
+    @later
+    def rates(self) -> dict[str, Tensor]:
+        """Rates of the displacements of nodal pads (T, nodes, 2 fields) [m/s]."""
+        widths, pads = self._stepper.parameters.model.nodal_widths, self._stepper.rig.pads
+        parts = torch.from_numpy(self._out.rate[: len(self.t)]).split([*widths.values()], -1)
+        return {name: x.unflatten(-1, (pads[name].nodes, -1)) for name, x in zip(widths, parts)}
+
+    @later
+    def energy(self) -> dict[str, Tensor]:
+        """Stored energies (T,) [J], by name."""
+        return stored(self._stepper.rig, self.state, self.displacement)
+
+    @later
+    def stored_energy(self) -> Tensor:
+        """Sum of the stored energies (T,) [J], without a graph."""
+        if self._stepper.parameters.model.nodal_widths:
+            return sum(self.energy.values(), torch.zeros_like(self.t)).detach()
+        return torch.from_numpy(self._out.stored[: len(self.t)])
+
+    @later
+    def dissipated(self) -> dict[str, Tensor]:
+        """Energies dissipated since t[0] (T,) [J], by name."""
+        return self._integrals("dissipated")
+
+    @later
+    def supplied(self) -> dict[str, Tensor]:
+        """Energies supplied since t[0] (T,) [J], by name."""
+        return self._integrals("supplied")
+
+    @later
+    def injected(self) -> Tensor:
+        """Positive part of the sources' work since t[0] (T,) [J]."""
+        return self._integral("injected", -1)
+
+    @later
+    def knots(self) -> Tensor:
+        return torch.from_numpy(self._out.knots)
+
+    @later
+    def step_choice(self) -> dict[str, Any]:
+        """How the steps were chosen."""
+        stepper = self._stepper
+        if stepper.step is not None or stepper.knots is not None:
+            return {"knots" if stepper.step is None else "step_s": stepper.step}
+        return {"rtol": stepper.rtol, "atol": stepper.atol}
+
+    @later
+    def made_by(self) -> dict[str, Any]:
+        made = {"torchsoft": VERSION, "method": METHOD}
+        return {**made, **self._stepper.rig.description(), "steps": self.step_choice}
+
+    @later
+    def units(self) -> dict[str, str]:
+        return units(self._stepper.rig)
+
+    @later
+    def setup(self) -> Setup:
+        return Setup.of(self._stepper.rig)
+
+    @later
+    def contact_state(self) -> dict[str, Tensor]:
+        """State of every contact point by contact, int8 (T, points): 0 separated, 1 sticking, 2
+        slipping."""
+        state = State(*({k: x.detach() for k, x in part.items()} for part in self.state))
+        return contact_states(self._stepper.rig, state, self.force, self.rates)
+
+    @later
+    def _signals(self) -> Tensor:
+        """The signals at the outputs, with their graph where there is one."""
+        stepper, known = self._stepper, None
+        if not self.y.requires_grad:
+            known = self._motion.at(self.t)
+        return stepper.rig.follow(self.t, stepper.reference) if known is None else known
+
+    def _recorded_of(self, kind: str) -> dict[str, Tensor]:
+        slices, recorded = self._stepper.parameters.model.recorded, self.recorded
+        assert recorded is not None
+        return {name: recorded[:, here] for (of, name), here in slices.items() if of == kind}
+
+    def _integral(self, name: str, number: int) -> Tensor:
+        rows = torch.from_numpy(self._out.integrals)[: len(self.t), number]
+        return without_gradient(name, rows, self.y)
+
+    def _integrals(self, kind: str) -> dict[str, Tensor]:
+        every = self._stepper.parameters.model.integrals
+        return {
+            one.name: one.factor * self._integral(one.name, one.number)
+            for one in every if one.kind == kind
+        }  # fmt: skip
 
     def __getitem__(self, channel: str) -> Tensor:
         """A channel (T,), by its name or a short one. Raises `KeyError` naming those that are
@@ -141,7 +246,7 @@ class Trajectory(Shown):
             return self.channels[channel]
         touch = self.touch
         if touch is not None and self.recorded is not None and channel in touch:
-            return touch[channel].value(self.recorded)
+            return touch.force_sums([channel])[0].value(self.recorded)
         known = suggestion(channel, self.channels, "it has")
         more = "none, since it was loaded, without its rig" if touch is None else touch.shown
         raise KeyError(f"the run has no channel `{channel}`; {known}, and of touch {more}")
@@ -228,20 +333,6 @@ class Trajectory(Shown):
             )
         return int((self.t - time).abs().argmin())
 
-    @cached_property
-    def contact_state(self) -> dict[str, Tensor]:
-        """State of every contact point by contact, int8 (T, points): 0 separated, 1 sticking, 2
-        slipping; -1 where a point touches and nobody knows, since the rig's parameters are no
-        longer those of the run."""
-        if self.known_contact_state is not None:
-            return self.known_contact_state
-        rig = self.rig
-        if rig is not None and rig.description()["parameters"] == self.made_by["parameters"]:
-            state = State(*({k: x.detach() for k, x in part.items()} for part in self.state))
-            return contact_states(rig, state, self.force, self.rates)
-        touching = {name: force[..., 0] > 0 for name, force in self.force.items()}
-        return {name: -there.to(torch.int8) for name, there in touching.items()}
-
     def plot(self, **options: Any) -> Figure:
         """A dashboard of the run as a matplotlib figure; options of
         `torchsoft.plot.dashboard.dashboard`."""
@@ -259,7 +350,7 @@ class Trajectory(Shown):
 
     def to_xarray(self) -> xr.Dataset:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""
-        from torchsoft.solve.formats import to_xarray
+        from torchsoft.solve.netcdf import to_xarray
 
         return to_xarray(self)
 
@@ -280,20 +371,20 @@ class Trajectory(Shown):
     def to_vtk(self, path: str | Path, times: Sequence[float] | None = None) -> list[Path]:
         """Write the pads for ParaView and meshio: displacements [m], strains, stresses [Pa], one
         .vtu a sample and a .pvd that lists them; the files written. See
-        `torchsoft.solve.formats.write`."""
-        from torchsoft.solve.formats import write
+        `torchsoft.solve.vtk.write`."""
+        from torchsoft.solve.vtk import write
 
         return write(self, Path(path), times)
 
     def to_mcap(self, path: str | Path) -> None:
         """Write the channels as an MCAP log, a message a sample; needs the extra `export`."""
-        from torchsoft.solve.formats import write_log
+        from torchsoft.solve.mcap import write_log
 
         write_log(Path(path), self.to_xarray(), {})
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF with a checksum. The file appears whole or not at all."""
-        from torchsoft.solve.formats import save
+        from torchsoft.solve.netcdf import save
 
         save(self.to_xarray(), path)
 
@@ -301,195 +392,6 @@ class Trajectory(Shown):
     def load(path: str | Path) -> Trajectory:
         """The run that `save` wrote, without its rig. Raises `ValueError` for any other file and
         for one that is damaged, and `OSError`."""
-        from torchsoft.solve.formats import read
+        from torchsoft.solve.netcdf import from_xarray, load
 
-        return read(path)
-
-
-class Ledger(NamedTuple):
-    """What a run is judged by: all stored energy (T,) [J]; energies dissipated (T, names) and all
-    that is supplied (T,), and injected in all [J]; the largest force on a contact point [N];
-    largest displacements of the loaded nodes of pads [m]; how its steps were chosen."""
-
-    stored: Array
-    names: Sequence[str]
-    dissipated: Array
-    supplied: Array
-    injected: float
-    force: float
-    displaced: dict[str, float]
-    steps: dict[str, Any]
-
-    @classmethod
-    def of(cls, run: Trajectory) -> Ledger:
-        known = getattr(vars(run).get("_rest"), "ledger", None)
-        if known is not None:
-            return known
-        plain = lambda parts: [part.detach().numpy() for part in parts.values()]
-        none = np.zeros(len(run.t))
-        force = max((float(x.detach().norm(dim=-1).max()) for x in run.force.values()), default=0.0)
-        return cls(
-            sum(plain(run.energy), none), [*run.dissipated],
-            np.stack(plain(run.dissipated), 1),
-            sum(plain(run.supplied), none), float(run.injected[-1].detach()), force, {},
-            run.made_by["steps"],
-        )  # fmt: skip
-
-
-def displaced(run: Trajectory, pad: str) -> float:
-    """Largest displacement of a pad's nodes [m]."""
-    return float(run.displacement[pad].detach().norm(dim=-1).max())
-
-
-# Channels of touch: recorded forces of a run as read by sensors on pads, under them and at
-# bodies.
-#
-# `NAME.QUANTITY`, in an array `NAME.QUANTITY.NUMBER`: load_x, load_y, load_theta of a body (by
-# contacts and pads, world axes), force_x, force_y of a pad (on its base, in the base's axes; its
-# moment is the channel M_NAME), normal and shear of a contact's points and of taxels, and the
-# centre of their normal forces.
-
-
-LIGHT = 1e-3
-"""Force [N] that a centre of pressure counts besides the normal forces, at coordinate zero: there
-it lies without contact, and with 10 N it is off by a ten-thousandth."""
-
-
-class ForceSum(NamedTuple):
-    """A channel: the sum of weight times recorded force, for a centre of pressure over that of
-    `over` and `LIGHT`."""
-
-    at: Index
-    weight: Array
-    over: Array | None = None
-
-    def value(self, recorded: Tensor) -> Tensor:
-        """(T,) of the recorded forces (T, recorded)."""
-        parts = recorded[:, torch.from_numpy(self.at)]
-        total = parts @ torch.from_numpy(self.weight)
-        return total if self.over is None else total / self.lower(recorded)
-
-    def lower(self, recorded: Tensor) -> Tensor:
-        """Divisor of a centre's moment (T,) [N]."""
-        return recorded[:, torch.from_numpy(self.at)] @ torch.from_numpy(self.over) + LIGHT
-
-
-class Sums(NamedTuple):
-    """Sums of recorded forces: number c has the entries from start[c] on."""
-
-    start: Index
-    at: Index
-    weight: Array
-
-
-class Touch:
-    """The channels of touch of a rig, by name; they are made when they are first asked for."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._rig = rig
-
-    @cached_property
-    def _arrays(self) -> dict[str, tuple[Any, Array]]:
-        """Weights (., points) on the normal forces at all points, and coordinates along the pad's
-        surface, by the name of a contact or of taxels."""
-        rig, first, out = self._rig, dict[str, int](), dict[str, tuple[Any, Array]]()
-        places = {name: rig.pads[c.pad].point_coordinates for name, c in rig.contacts.items()}
-        count = sum(map(len, places.values()))
-        every = sparse.csr_array(sparse.identity(count))
-        for name, own in places.items():
-            first[name] = sum(len(places[other]) for other in first)
-            out[name] = every[first[name] : first[name] + len(own)], own
-        for name, taxels in rig.taxels.items():
-            own = sparse.csr_array(taxels.weights(rig.pads[taxels.pad]))
-            parts = [out[k][0] for k, contact in rig.contacts.items() if contact.pad == taxels.pad]
-            none = sparse.csr_array((len(taxels.places), count))
-            out[name] = sum((own @ part for part in parts), none), taxels.places
-        return out
-
-    @cached_property
-    def single(self) -> dict[str, tuple[str, ForceSum]]:
-        """Unit and sum of the channels that are in no array."""
-        rig, out = self._rig, dict[str, tuple[str, ForceSum]]()
-        for name, (weights, places) in self._arrays.items():
-            over = np.ones(len(places)) @ weights
-            at = np.flatnonzero(over)
-            out[f"{name}.centre"] = "m", ForceSum(2 * at, (places @ weights)[at], over[at])
-        at = 2 * sum(len(self._arrays[name][1]) for name in rig.contacts)
-        names = [
-            (key, unit)
-            for name in rig.pads
-            for key, unit in (
-                (f"{name}.force_x", "N"),
-                (f"{name}.force_y", "N"),
-                (f"M_{name}", "N.m"),
-            )
-        ] + [
-            (f"{name}.{key}", unit)
-            for name in rig.bodies
-            for key, unit in zip(ON_BODY, ("N", "N", "N.m"))
-        ]
-        return out | {
-            name: (unit, ForceSum(np.array([at + i]), np.ones(1)))
-            for i, (name, unit) in enumerate(names)
-        }
-
-    @cached_property
-    def arrays(self) -> dict[str, int]:
-        """Arrays of forces [N], and how many there are in each."""
-        sizes = {name: len(places) for name, (_, places) in self._arrays.items()}
-        return {f"{name}.{kind}": size for name, size in sizes.items() for kind in FORCES}
-
-    def __iter__(self) -> Iterator[str]:
-        yield from self.single
-        yield from self.expanded([*self.arrays])
-
-    @property
-    def shown(self) -> str:
-        """The names, for messages."""
-        return enumerated(self)
-
-    def __contains__(self, name: object) -> bool:
-        array, _, number = str(name).rpartition(".")
-        inside = number.isdecimal() and int(number) < self.arrays.get(array, 0)
-        return name in self.single or (inside and str(int(number)) == number)
-
-    def __getitem__(self, name: str) -> ForceSum:
-        """Raises `KeyError` naming the channels that there are."""
-        if name not in self:
-            raise KeyError(f"there is no channel of touch `{name}`, but there are {self.shown}")
-        if name in self.single:
-            return self.single[name][1]
-        owner, kind, number = name.rsplit(".", 2)
-        row = self._arrays[owner][0][[int(number)]]
-        return ForceSum(2 * row.indices.astype(np.int64) + FORCES.index(kind), row.data)
-
-    def unit(self, name: str) -> str:
-        """SI unit of a channel."""
-        return self.single[name][0] if name in self.single else "N"
-
-    def expanded(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Names, with the channels of an array in the place of its own."""
-        numbered = lambda name: [f"{name}.{i}" for i in range(self.arrays.get(name, 0))]
-        return tuple(one for name in names for one in numbered(name) or [name])
-
-    def sums(self, names: Sequence[str]) -> Sums:
-        """Weights of the channels: each one's sum, and then the divisors of centres."""
-        felt = [self[name] for name in names]
-        parts = [(one.at, one.weight) for one in felt]
-        parts += [(one.at, one.over) for one in felt if one.over is not None]
-        none: Any = [np.zeros(0, np.int64)], [np.zeros(0)]
-        return Sums(
-            np.cumsum([0, *(len(at) for at, _ in parts)]),
-            np.concatenate([*(at for at, _ in parts), *none[0]]),
-            np.concatenate([*(weight for _, weight in parts), *none[1]]),
-        )
-
-    def slopes(self, names: Sequence[str], of_sums: Tensor, recorded: Tensor) -> Tensor:
-        """Derivatives (T, channels, n) of the channels from those of their sums (T, sums, n)."""
-        out, next_one = of_sums[:, : len(names)].clone(), len(names)
-        for i, felt in enumerate(self[name] for name in names):
-            if felt.over is not None:
-                down = felt.value(recorded)[:, None] * of_sums[:, next_one]
-                out[:, i] = (out[:, i] - down) / felt.lower(recorded)[:, None]
-                next_one += 1
-        return out
+        return from_xarray(load(path), str(path))

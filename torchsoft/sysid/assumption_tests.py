@@ -176,7 +176,8 @@ class Linearised:
 
     def refit_test(self, one: Suspect, fit: Fit, score: AssumptionTest) -> AssumptionTest:
         """Test of a suspect by a refit; without estimates where that has not converged."""
-        left, gain = fit.square, self.square - fit.square
+        r = fit.at.r if fit.check.bias is None else fit.check.finer.r
+        left, gain = float(r @ r), self.square - float(r @ r)
         rest = max(1.0, left / self.dof)
         favoured, sd = one.amount, (rest / max(abs(gain), 1e-300)) ** 0.5 * one.amount
         if one.has_amount:
@@ -190,9 +191,9 @@ class Linearised:
         if one.has_amount and favoured != 0.0:
             moves = moves * one.amount / favoured
         test = self.outcome(
-            one, moves, gain, left, favoured, sd, fit.at.r, self.r, refitted=True,
+            one, moves, gain, left, favoured, sd, r, self.r, refitted=True,
             under=self.values(x) if fit.converged else {},
-            passed=not self.alarms(fit.at.r, fit.J),
+            passed=not self.alarms(r, fit.J),
         )  # fmt: skip
         return replace(test, detectable=score.detectable)
 

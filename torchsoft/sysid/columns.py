@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torchsoft import csvfile
 from torchsoft.csvfile import UNITS
 from torchsoft.display import enumerated, nearest
-from torchsoft.solve.formats import load, read_log
+from torchsoft.solve.mcap import read_log
+from torchsoft.solve.netcdf import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
 

@@ -19,14 +19,13 @@ from torch import Tensor
 from torchsoft.cost import RUN, Cost, rig_row, rig_step, steps_per_second
 from torchsoft.csvfile import UNITS
 from torchsoft.display import suggestion
-from torchsoft.physics.channels import Seen, measurable, read, units
+from torchsoft.physics.channels import Seen, Touch, measurable, read, units
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import net_loads
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
-from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.columns import Columns, Tables, Vocabulary, read_tables
 from torchsoft.sysid.configuration import (
     Column,

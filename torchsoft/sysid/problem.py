@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torchsoft.display import Shown, amount, suggestion
+from torchsoft.physics.channels import Touch
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
-from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.assumptions import Suspect
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (

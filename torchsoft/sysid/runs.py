@@ -307,7 +307,7 @@ class Runner:
 
 
 EARLY = 2e-3
-"""Steps [s] before frozen ones, where the run of a changed recording starts earlier."""
+"""Steps [s] before frozen ones, or after them, where a run is longer than that of the fit."""
 
 
 def since(steps: Steps, start: float) -> Steps:

@@ -22,13 +22,19 @@ from torchsoft.sysid.assumption_tests import EVIDENT, AssumptionTest, Linearised
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
 from torchsoft.sysid.plan import LOOSE, USUAL, continued, refine_steps, scanned
+from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.runs import EARLY
 from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
 BRACKET, FINALISTS = 16, 3
 """Suspects of a bracket, and those of it that are fitted until they converge."""
+
+FAR = 2.0
+"""Misfit per sample above which rounds of halving have steps of the tolerance `LOOSE`, whose errors
+are small beside the misfit."""
 
 FAINT = 0.01
 """Part of the misfit above the noise that a suspect explains by its score test to be in the first
@@ -191,9 +197,10 @@ def search(
     It ends when refits took `effort` times the work of the fit.
     """
     queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))  # 1.
-    most = end.runner.work * (1.0 + effort)
+    most, finest = end.runner.work * (1.0 + effort), end.check.rtol
     bar = tqdm(total=len(queue), unit="suspect", disable=hidden(end.progress))
     with bar, warnings.catch_warnings(action="ignore"):
+        end = on_loose_steps(end) if end.chi2 > FAR else end
         end = end._replace(notify=lambda chi2: bar.set_postfix_str(f"chi2 = {chi2:.4g}"))
         least = max(EVIDENT, FAINT * (linear.square - linear.dof))
         size = max(BRACKET, sum(tests[one.name].gain >= least for one in queue if not one.costly))
@@ -207,13 +214,10 @@ def search(
                 evaluations *= KEPT
             dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
             yield from ((test, None) for test in dropped)
-            best, explained = np.inf, False
-            for one in sorted(fits, key=lambda one: fits[one].square):  # 3.
-                bar.set_description(plain(f"refit with {one.name} free"))
-                refit = completed(fits[one].by(end.rtol), best + COMPARABLE)
+            explained = False
+            for one, refit in refits(fits, finest, bar):  # 3.
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
-                best = min(best, refit.square)
                 explained = explained or bool(test.suspected and test.passed)
             if explained:
                 return
@@ -235,11 +239,12 @@ def first_steps(
 
 def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised) -> Fit | None:
     """The fit with a suspect free after the step that its score test predicts, or the best of some
-    parts of it, at the tolerance `LOOSE`; None where it cannot be simulated."""
+    parts of it, on the steps of the end; None where it cannot be simulated."""
     try:
-        start = fit_with(end, one.within(test.favoured)).by(max(LOOSE, end.rtol))
+        start = fit_with(end, one.within(test.favoured))
     except ValueError:
         return None
+    steps = covering(end.at.steps, start.problem)
     c, step = start.problem.coordinates, np.zeros(len(start.x))
     for (label, move), sd in zip(test.moves.items(), linear.sd):
         step[c.labels.index(label)] = move * sd
@@ -251,13 +256,24 @@ def first_step(end: Fit, one: Suspect, test: AssumptionTest, linear: Linearised)
     times, best = times / max(1.0, longest / FIRST_STEP), None
     for part in PARTS:
         x = start.within_bounds(start.x + part * times * step)
-        at = start.residuals(x, steps=start.rtol)
+        at = start.residuals(x, steps=steps)
         if not at.failed:
             fit = start._replace(x=x, at=at)
             best = fit if best is None or fit.square < best.square else best
         if best is not None and best.square < linear.square:
             break
     return best
+
+
+def covering(steps: Mapping[str, Frozen], problem: Problem) -> Mapping[str, Frozen]:
+    """Steps that go on to the end of the runs of a problem, which a delay of a sensor makes longer
+    than those of the fit."""
+    out = dict[str, Frozen]()
+    for one in (one for one in problem.recordings if one.name in steps):
+        knots, last = steps[one.name].knots, float(one.grid(problem.interpolated).t[-1])
+        later = [*np.arange(knots[-1] + EARLY, last, EARLY), last]
+        out[one.name] = Frozen(np.append(knots, later if last > knots[-1] else []))
+    return out
 
 
 def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
@@ -278,13 +294,31 @@ def carried_on(fit: Fit, evaluations: int) -> Fit:
     return fit
 
 
-def completed(fit: Fit, most: float = np.inf) -> Fit:
+def refits(
+    fits: Mapping[Suspect, Fit], finest: float, bar: "tqdm[Any]"
+) -> Iterator[tuple[Suspect, Fit]]:
+    """The fits, completed, the one that leaves least first."""
+    best = np.inf
+    for one in sorted(fits, key=lambda one: fits[one].square):
+        bar.set_description(plain(f"refit with {one.name} free"))
+        refit = completed(fits[one], finest, best + COMPARABLE)
+        best = min(best, refit.square)
+        yield one, refit
+
+
+def on_loose_steps(end: Fit) -> Fit:
+    """The end of a fit on steps of the tolerance `LOOSE`, or as it is where such a run fails."""
+    at = end.residuals(steps=max(LOOSE, end.rtol))
+    return end if at.failed else end._replace(at=at)
+
+
+def completed(fit: Fit, finest: float, most: float) -> Fit:
     """The fit, continued until it converges, with ratios at a bound scanned over their whole range;
-    on fine steps where it leaves at most `most` of the sum of squares."""
+    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares."""
     c = fit.problem.coordinates
     stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
     stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
     end = continued(fit, stage) or fit
     if end.square > most:
         return end._replace(converged=False)
-    return refine_steps(end, TIGHTENINGS if end.loss == "linear" else 0)
+    return refine_steps(end.by(finest), TIGHTENINGS if end.loss == "linear" else 0)

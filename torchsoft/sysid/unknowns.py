@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from torchsoft.display import suggestion
+from torchsoft.physics.channels import Touch
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.trajectory import Touch
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
 from torchsoft.sysid.recording import REACH, Array, Mask, Recording
 from torchsoft.tables import Table, line, shown

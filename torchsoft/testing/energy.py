@@ -13,7 +13,7 @@ from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.diagnostics import missing_energy
 from torchsoft.solve.simulate import simulate
-from torchsoft.solve.trajectory import Ledger, Trajectory
+from torchsoft.solve.trajectory import Trajectory
 
 ROUNDING = 1e-9
 """Part of all powers, taken without their signs, that may be missing at a state."""
@@ -64,7 +64,7 @@ def check_energy(
     """
     run = simulate(rig, t, y0=y0, rtol=rtol)
     faults = []
-    if not (part := missing_energy(Ledger.of(run))) <= residual:
+    if not (part := missing_energy(run)) <= residual:
         faults.append(
             f"{part:.2%} of the energy that was stored at the start and injected since is missing "
             f"or too much, and {residual:.2%} may be: take a smaller `rtol`, or see whether a law "

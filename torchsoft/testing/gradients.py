@@ -16,12 +16,13 @@ from torch import Tensor
 from torchsoft.caller import warn
 from torchsoft.display import Shown
 from torchsoft.physics.arguments import Numbers, tensor
+from torchsoft.physics.channels import Touch
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.gradients import directions
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RTOL, Initial, simulate, started
 from torchsoft.solve.simulate import Start as Begin
-from torchsoft.solve.trajectory import Touch, Trajectory
+from torchsoft.solve.trajectory import Trajectory
 from torchsoft.testing.energy import conclude
 
 Value = Callable[[Trajectory], Tensor]

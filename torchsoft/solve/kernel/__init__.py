@@ -13,8 +13,3 @@ def compiled(function: Callable[..., Any]) -> Any:
     """Mark of a kernel. A kernel allocates nothing and counts no references; `build` puts the
     compiler in the place of this."""
     return function
-
-
-def inlined(function: Callable[..., Any]) -> Any:
-    """Mark of a kernel that returns a view of its arguments, which only its callers can."""
-    return function

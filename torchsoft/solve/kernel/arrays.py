@@ -6,7 +6,7 @@ position in the vector p of all law parameters, "start" one in another array. No
 nodes of all pads, points the contact points of all contacts, dofs those of all nodal pads.
 
 Kernels call their tables alike: `rig` is a `System`, what they compute in is `work` (`Work`),
-`bars` (`Cotangents`) and `tangents`, and `call` has the arguments of an entry.
+`along` (`Directions`), and `call` has the arguments of an entry.
 """
 
 from typing import Annotated, Any, NamedTuple
@@ -41,6 +41,14 @@ PASSED = 0.25
 """A step that tolerances choose moves no body by more than this part of its size over a pad that it
 may touch: one that flies would else be through the pad between two steps."""
 
+AXES = 2
+"""Of the plane: components of a vector."""
+
+PAIR = 6
+"""Coordinates of a contact: of its body and of its pad's base. The law of relative motion has as
+inputs these, their rates and the wrench, and as outputs the relative pose, its rates and the loads
+on these coordinates."""
+
 MOTION, WRENCH = 10, 3
 """A contact point's law has as inputs its place in the base's frame and the relative pose of the
 body (5), their rates (5), its states s*, its weight and a h; as outputs its force on the pad with
@@ -49,11 +57,6 @@ but the powers are differentiated, by the motion and by s*."""
 
 CONDENSED, NODAL = range(2)
 """Kinds of pads: condensed onto its surface, or with the displacements of all of its nodes."""
-
-FIELD = 8
-"""Displacements of the four corners of an element in one field: its law has those of as many fields
-as any pad of the rig has, their rates and the element's constants as inputs, and as outputs the
-forces on them and the power that it dissipates."""
 
 LANES = 4
 """Elements whose law is called at once."""
@@ -72,22 +75,32 @@ class Bodies(NamedTuple):
     V_start: int
 
 
+class Ports(NamedTuple):
+    """What laws of sources read, one after the other: value and rate of every signal, positions of
+    all coordinates, their velocities, and states of sources. Per port the component y of the state
+    that it is, the free number of the coordinate whose position it is, and the row of the signals,
+    value and rate of each, that it is or follows; or -1."""
+
+    y: Index
+    number: Index
+    signal: Index
+
+
 class Sources(NamedTuple):
     """Actuators and weights, each an effort on one coordinate: law addresses, its parameters' ends
-    in p, coordinate pushed, power: its number among those that are integrated; the ends of what it
-    reads in signal and in coordinate, each with its rate; how many states of its own its law has,
-    and y_start of them. The law reads these and the length a h of the stage last, and gives the
-    effort and then their rates."""
+    in p, coordinate pushed, power: its number among those that are integrated; the ends of its
+    inputs, ports, a position before its velocity and its states last; how many states of its own
+    its law has, and y_start of them. The law reads these and the length a h of the stage last, and
+    gives the effort and then their rates."""
 
     linearise: Index
-    pullback: Index
+    push: Index
+    pull: Index
     p_start: Index
     pushed: Index
     power: Index
-    signal_start: Index
-    signal: Index
-    coordinate_start: Index
-    coordinate: Index
+    input_start: Index
+    input: Index
     states: Index
     y_start: Index
 
@@ -136,7 +149,10 @@ class Nodal(NamedTuple):
     matrices; law addresses of its elements, ends of their parameters in p. Per dof: X, place of its
     node (its own coordinate), and area. Per element: its dofs, -1 where it is bonded and for fields
     that its pad has not, and constants; their number is a multiple of `LANES`, the last without
-    dofs. surface: dof of every surface dof."""
+    dofs. surface: dof of every surface dof. field: displacements of an element in one field; its
+    law has as inputs those of as many fields as any pad of the rig has, their rates and the
+    element's constants, of which the first are their gradients at the centre, and as outputs the
+    forces on them and the power that it dissipates."""
 
     dof_start: Index
     element_start: Index
@@ -147,8 +163,8 @@ class Nodal(NamedTuple):
     band_start: Index
     value: Index
     linearise: Index
-    pullback: Index
     push: Index
+    pull: Index
     p_first: Index
     p_last: Index
     X: Array
@@ -156,6 +172,7 @@ class Nodal(NamedTuple):
     dof: IndexMatrix
     constants: Matrix
     surface: Index
+    field: int
 
 
 class Contacts(NamedTuple):
@@ -172,9 +189,11 @@ class Contacts(NamedTuple):
     distance: Index
     value: Index
     linearise: Index
-    pullback: Index
+    push: Index
+    pull: Index
     free_linearise: Index
-    free_pullback: Index
+    free_push: Index
+    free_pull: Index
     stored: Index
     p_start: Index
     point_start: Index
@@ -199,6 +218,7 @@ class Points(NamedTuple):
 
 PARTS = {
     "body": Bodies,
+    "port": Ports,
     "source": Sources,
     "pad": Pads,
     "back": Backs,
@@ -265,25 +285,26 @@ class Errors(NamedTuple):
 
 SCRATCH: dict[str, dict[str, str]] = {
     "Work": {  # of a stage
+        "ports": "ports",  # with q and V
         "coordinates": "q V V_old load",
         # of every contact its bodies' motion and the wrench on its pad, their relative motion and
         # loads with derivatives, and those of the motion by velocities of the stage
-        "contacts 15": "pair",
+        "contacts pair+pair+wrench": "pair",
         # places of the bodies' innermost points in the bases' frames, now and where a step began
-        "contacts 2": "inner inner_before",
-        "contacts 12": "relative",
-        "contacts 12 15": "by_pair",
-        "contacts 6 6": "by_stage",
+        "contacts axes": "inner inner_before",
+        "contacts pair+pair": "relative",
+        "contacts pair+pair pair+pair+wrench": "by_pair",
+        "contacts pair pair": "by_stage",
         "condensed": "zeta zeta_rate",  # of a chain
         # displacement u*, rates (without contact, now, before and after a Newton step), forces by
         # the law and by the linear relations (now, before, after)
-        "nodes 2": "u free u_dot u_dot_old F F_linear F_old F_new",
+        "nodes axes": "u free u_dot u_dot_old F F_linear F_old F_new",
         "nodes2": "u_dot_new",
         "points inputs": "x",  # the law's inputs, outputs and Jacobian by rows
         "points outputs": "out",
         "points jacobian": "J",
         # derivatives by (displacement (2), coordinates (6)): by rates of the stage and by positions
-        "points rows 8": "H S",
+        "points rows axes+pair": "H S",
         # numbers of points near and touching, from every pad's first point on
         "int points": "window active",
         # numbers of those, nodes of the window, numbers of touched nodes
@@ -292,8 +313,8 @@ SCRATCH: dict[str, dict[str, str]] = {
         "pads": "power held",
         "int nodes": "slot touched held_touched",
         "widest widest": "A P",  # one pad's share of Newton's system
-        "2 widest": "PB",
-        "6 8": "K",
+        "axes widest": "PB",
+        "pair axes+pair": "K",
         "widest free": "Hc",
         "free widest": "Rf",
         "free 1": "r r_before b",
@@ -342,39 +363,29 @@ SCRATCH: dict[str, dict[str, str]] = {
         "2": "speed",
         "pads 3": "wrenches",
     },
-    "Cotangents": {  # of u', rate and u, q and V, of a law's outputs and a point's bodies (by)
-        "4 widest": "surface",
-        "dofs": "rate_of own",
-        "2 2": "pair",
-        "free free": "matrix",
-        "free 1": "nu",
-        "free": "V_bar",
-        "nodes 2": "rate u",
-        "coordinates": "q V load",  # of an output's loads, and of the pads' forces and moments
-        "pads 3": "wrenches",
-        "points rows": "out",
-        "rows": "weights",
-        "8": "by moved",  # by rates and by positions of a point
-        "corners lanes": "element",
-        "3 state": "state",
-    },
-    "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
-        "rows": "weights",
-        "corners lanes": "element",
-        "parameters": "gradient direction",
-        "rows columns": "change",
-        "free columns": "r V",
-        "nodes 2 columns": "u v own_rate",
-        "dofs columns": "free rate_of",
-        "int pads 2": "span",
-        "widest": "zeta rate",
-        "widest columns": "dzeta drate",
-        "2 columns": "base_rate at_point",
-        "points rows columns": "e",
+    # derivatives in so many directions (columns), or cotangents (one column)
+    "Directions": {
+        "ports columns": "ports",  # with q and V
+        "coordinates columns": "q V",
+        "free columns": "r dV",  # of the bodies' equations and their velocities
+        # of nodes: displacements u*, rates before the change of forces, of touched ones after it
+        "nodes axes columns": "u rate own_rate",
+        "dofs columns": "free rate_of",  # the same of nodal pads' rates
+        "axes columns": "base_rate",
+        "points rows columns": "out",  # of a law's outputs
+        "columns axes+pair": "at_point",
+        "rows columns": "effort",
         "recorded columns": "recorded",  # as `recorded_size` orders it
-        "8 columns": "moved",
-        "states columns": "decay",
-        "state columns": "before first",
+        "state columns": "start first end",
+        # of laws: a direction of the parameters, and outputs along it, or weights of them
+        "parameters": "direction",
+        "outputs": "change",
+        "corners+1 lanes": "element",
+        "int pads 2": "span",  # dofs of every pad that count
+        "widest": "zeta z_dot by_u by_rate",
+        "widest columns": "dzeta dz_dot",
+        "2 axes": "reaction",
+        "free free": "matrix",
     },
     # of every stage y*, q, V, the touching points of every pad, their numbers with u and u',
     # nodal pads' u'
@@ -403,7 +414,7 @@ def declared(kind: str) -> Any:
 
 
 KINDS: dict[str, Any] = {kind: declared(kind) for kind in SCRATCH}
-Work, Step, Cotangents, Tangents, Tape = KINDS.values()
+Work, Step, Directions, Tape = KINDS.values()
 
 
 @table
@@ -490,7 +501,7 @@ class Backward(NamedTuple):
 
     rig: Annotated[Any, System]
     work: Annotated[Any, Work]
-    bars: Annotated[Any, Cotangents]
+    along: Annotated[Any, Directions]
     tape: Annotated[Any, Tape]
     h: Array
     signals: Cube
@@ -501,8 +512,8 @@ class Backward(NamedTuple):
     outputs_bar: Matrix
     recorded_bar: Matrix
     out_signals_bar: Cube
-    y_bar: Array
-    p_bar: Array
+    y_bar: Matrix
+    p_bar: Matrix
     signals_bar: Cube
     failed: Index
 
@@ -513,7 +524,7 @@ class Forward(NamedTuple):
 
     rig: Annotated[Any, System]
     work: Annotated[Any, Work]
-    tangents: Annotated[Any, Tangents]
+    along: Annotated[Any, Directions]
     tape: Annotated[Any, Tape]
     h: Array
     signals: Cube
@@ -537,29 +548,22 @@ def recorded_size(rig: Any) -> int:
     return 2 * len(rig.point_X) + 3 * len(rig.pad_base) + len(rig.body_free)
 
 
-def columns(rig: Any) -> Any:
-    """Numbers of inputs by which the laws of sources are differentiated: what they read, with
-    rates, and their states."""
-    return (
-        2 * (np.diff(rig.source_signal_start) + np.diff(rig.source_coordinate_start))
-        + rig.source_states
-    )
-
-
 def scratch(kind: str, rig: Any, state: int, **sizes: int) -> Any:
     """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those
     that it does not decide."""
     states, nodes = int(rig.contact_states.max(initial=1)), int(rig.pad_node_start[-1])
-    reads, efforts = 1 + columns(rig).max(initial=1), 1 + rig.source_states.max(initial=0)
+    reads = 1 + int(np.diff(rig.source_input_start).max(initial=1))
+    efforts = 1 + int(rig.source_states.max(initial=0))
     dofs, band = np.diff(rig.nodal_dof_start), 2 * rig.nodal_band + 1
     widest, corners = 2 * int(np.diff(rig.pad_node_start).max(initial=0)), rig.nodal_dof.shape[1]
     sizes |= {
         "state": state, "coordinates": len(rig.body_free), "free": len(rig.body_coordinate),
         "contacts": len(rig.contact_pad), "points": len(rig.point_X), "pads": len(rig.pad_base),
         "nodes": nodes, "nodes2": 2 * nodes, "condensed": 2 * nodes, "widest": widest,
-        "reads": int(reads), "efforts": int(efforts), "effort_jacobian": int(reads * efforts),
-        "states": states, "rows": max(WRENCH + states + 2, int(efforts)),
-        "outputs": WRENCH + states + 4,
+        "reads": reads, "efforts": efforts, "effort_jacobian": reads * efforts,
+        "ports": len(rig.port_y), "axes": AXES, "pair": PAIR, "wrench": WRENCH,
+        "rows": max(WRENCH + states + AXES, efforts),
+        "outputs": max(WRENCH + states + 4, efforts),
         "inputs": MOTION + states + 2, "jacobian": (WRENCH + states + 2) * (MOTION + states),
         "free_inputs": states + 2, "free_outputs": states + 2, "square": states**2,
         "lanes": LANES, "groups": int(rig.nodal_element_start[-1]) // LANES,
@@ -584,4 +588,8 @@ def scratch(kind: str, rig: Any, state: int, **sizes: int) -> Any:
         constants = rig.nodal_constants
         grouped = constants.reshape(sizes["groups"], LANES, constants.shape[1])
         made["element_x"][:, 2 * corners :] = grouped.swapaxes(1, 2)
+    if "ports" in made:
+        count, end = sizes["coordinates"], sizes["ports"] - int(rig.source_states.sum())
+        made["V"] = made["ports"][end - count : end]
+        made["q"] = made["ports"][end - 2 * count : end - count]
     return KINDS[kind](**made)

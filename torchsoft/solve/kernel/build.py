@@ -1,16 +1,16 @@
 """Machine code of the kernels, made ahead: numba types them, LLVM compiles them once, all together.
 
-    python -m torchsoft.solve.kernel.build [ENTRY ...] [--level LEVEL ...] [--out DIR]
+    python -m torchsoft.solve.kernel.build [--level LEVEL ...] [--out DIR]
 
 numba alone links every kernel into each of its callers and compiles it again there. Here it writes
-unoptimised code only, of which every entry becomes one module that is compiled once. This module
-changes numba for its process, so nothing else imports it.
+unoptimised code only, which becomes one module that is compiled once. This module changes numba for
+its process, so nothing else imports it.
 """
 
 import argparse
+import gc
 import importlib
 import time
-from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from numba.core import codegen
 from numba.core.cpu import CPUContext
 from numba.core.datamodel import models
 from numba.core.datamodel.registry import register_default
+from numba.core.dispatcher import Dispatcher
 from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr
@@ -41,6 +42,8 @@ from torchsoft.solve.kernel.objects import (
     remove_old,
 )
 from torchsoft.solve.kernel.table import layout
+
+DATA = "kernels.data"
 
 KNOWN = {"sin", "cos", "sqrt", "hypot", "pow"}
 """Functions of the mathematics library that kernels may call."""
@@ -120,30 +123,30 @@ def finalize(self: Any) -> None:
     self._finalized = True
 
 
-def entry_module(name: str) -> llvm.ModuleRef:
-    """The unoptimised code of an entry and of all that it calls; `name` is a
-    void(void*, void*, table's address) in it, every other function is internal."""
-    module, kind = ENTRIES[name]
-    dispatcher = getattr(importlib.import_module(module), name)
-    dispatcher.compile((TableType(kind),))
-    (result,) = dispatcher.overloads.values()
-    linked, todo = {}, [result.library]
+def whole_module() -> llvm.ModuleRef:
+    """The unoptimised code of all entries and of what they call. An entry is a void(void*, void*,
+    table's address) in it, every other function is internal."""
+    # llvmlite's memory manager has room for the table of outside functions only beside other data
+    whole = llvm.parse_assembly(f"@{DATA} = global i64 1")
+    entries, linked, todo = dict[str, str](), set[Any](), list[Any]()
+    for name, (module, kind) in ENTRIES.items():
+        dispatcher = getattr(importlib.import_module(module), name)
+        dispatcher.compile((TableType(kind),))
+        (result,) = dispatcher.overloads.values()
+        entries[result.fndesc.llvm_func_name] = name
+        todo.append(result.library)
+    whole.data_layout = str(todo[0]._final_module.data_layout)
     while todo:
         if (library := todo.pop()) not in linked:
-            linked[library] = None
+            linked.add(library)
             todo += library._linking_libraries
-    # llvmlite's memory manager has room for the table of outside functions only beside other data
-    whole = llvm.parse_assembly(f"@{name}.data = global i64 1")
-    whole.data_layout, whole.name = str(result.library._final_module.data_layout), name
-    for library in linked:
-        whole.link_in(library._final_module, preserve=True)
+            whole.link_in(library._final_module, preserve=True)
     for number, inside in enumerate([*whole.functions, *whole.global_variables]):
-        if inside.name == result.fndesc.llvm_func_name:
-            inside.name = name
-        elif (
-            not inside.is_declaration and inside.name != f"{name}.data"
-        ):  # numba's names count what was compiled before
-            inside.name, inside.linkage = f"{name}.{number}", "internal"
+        if inside.name in entries:
+            inside.name = entries[inside.name]
+        elif not inside.is_declaration and inside.name != DATA:
+            # numba's names count what was compiled before
+            inside.name, inside.linkage = f"kernel.{number}", "internal"
     whole.verify()
     return whole
 
@@ -168,41 +171,45 @@ def compiled_object(module: str, target: str) -> bytes:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("entries", nargs="*", default=list(ENTRIES))
     parser.add_argument("--level", action="append", choices=LEVELS)
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
+    gc.disable()  # of a short process, a sixth of whose time it would take
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     library: Any = codegen.CPUCodeLibrary
     context: Any = CPUContext
+    dispatcher: Any = Dispatcher
+    template = dispatcher.get_call_template
     library.finalize = finalize
     context.get_executable = lambda *_: [].append  # a new object each time, which nobody calls
+    # a kernel is not compiled anew for a constant argument
+    dispatcher.get_call_template = lambda self, args, keywords: template(
+        self, tuple(map(types.unliteral, args)), keywords
+    )
     kernel.compiled = lambda function: numba.njit(**OPTIONS)(placeless(function))
-    kernel.inlined = lambda function: numba.njit(inline="always", **OPTIONS)(placeless(function))
     if asked.out is None:
         remove_old()
     with alone() if asked.out is None else nullcontext():
-        for name in asked.entries:
-            make(name, asked.level or [level()], asked.out)
+        make(asked.level or [level()], asked.out)
 
 
-def make(name: str, targets: Sequence[str], out: Path | None) -> None:
-    """Compile an entry for levels of processors, into a folder `out`, or into that of the kernels
-    where it is missing."""
+def make(targets: list[str], out: Path | None) -> None:
+    """Compile the kernels for levels of processors, into a folder `out`, or into that of the
+    kernels where they are missing."""
     if out is None:
-        targets = [one for one in targets if read(FOLDERS[0] / f"{name}-{one}.o") is None]
+        targets = [one for one in targets if read(FOLDERS[0] / f"{one}.o") is None]
     if not targets:
         return
-    start, module = time.perf_counter(), str(entry_module(name))
+    start, module = time.perf_counter(), str(whole_module())
     for target in targets:
         content = compiled_object(module, target)
         if out is None:
-            keep(name, target, content)
+            keep(target, content)
         else:
             (out / NAME).mkdir(exist_ok=True)
-            (out / NAME / f"{name}-{target}.o").write_bytes(content)
-    print(f"{name}: {time.perf_counter() - start:.1f} s")
+            (out / NAME / f"{target}.o").write_bytes(content)
+    print(f"kernels: {time.perf_counter() - start:.1f} s")
 
 
 if __name__ == "__main__":

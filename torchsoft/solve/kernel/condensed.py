@@ -9,7 +9,8 @@ and u = C sum of J z. At the end of a stage, with rest = tau + a h,
 from typing import Any
 
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.linear import add, dot, row_of
+from torchsoft.solve.kernel.arrays import AXES
+from torchsoft.solve.kernel.linear import add, dot, put
 from torchsoft.solve.kernel.table import Array
 
 NEGLIGIBLE = 1e-14
@@ -42,6 +43,13 @@ def mobility(rig: Any, pad: int, a: float) -> float:
 def size_of(rig: Any, pad: int) -> int:
     """Number of surface dofs."""
     return 2 * (rig.pad_node_start[pad + 1] - rig.pad_node_start[pad])
+
+
+@compiled
+def row_of(rig: Any, pad: int, dof: int) -> slice:
+    """Row of a surface dof in the compliances."""
+    start, size = rig.condensed_C_start[pad], size_of(rig, pad)
+    return slice(start + dof * size, start + (dof + 1) * size)
 
 
 @compiled
@@ -79,14 +87,14 @@ def displace(rig: Any, work: Any, pad: int, low: int, high: int) -> None:
     of `begin`."""
     first, last = rig.pad_node_start[pad], rig.pad_node_start[pad + 1]
     zeta, rate = work.zeta[2 * first : 2 * last], work.zeta_rate[2 * first : 2 * last]
-    left, right, size = 0, 2 * (last - first), 2 * (last - first)
+    left, right = 0, 2 * (last - first)
     while left < right and abs(zeta[left]) < NEGLIGIBLE:
         left += 1
     while right > left and abs(zeta[right - 1]) < NEGLIGIBLE:
         right -= 1
     zeta, rate, soft = zeta[left:right], rate[left:right], softness(rig, pad)
     for i in range(2 * low, 2 * high):
-        row = row_of(rig.condensed_C, rig.condensed_C_start[pad], i - 2 * first, size)[left:right]
+        row = rig.condensed_C[row_of(rig, pad, i - 2 * first)][left:right]
         work.u[i // 2, i % 2], work.free[i // 2, i % 2] = (
             soft * dot(row, zeta),
             -soft * dot(row, rate),
@@ -111,15 +119,15 @@ def relation(rig: Any, work: Any, pad: int, a: float) -> None:
 @compiled
 def propose(rig: Any, work: Any, pad: int, a: float) -> None:
     """Nodal rates work.u_dot_new under the forces work.F_new, in the window."""
-    first, start, size = rig.pad_node_start[pad], rig.condensed_C_start[pad], size_of(rig, pad)
-    scale, low, high = mobility(rig, pad, a), 2 * work.low[pad], 2 * work.high[pad]
+    first, scale = rig.pad_node_start[pad], mobility(rig, pad, a)
+    low, high = 2 * work.low[pad], 2 * work.high[pad]
     rates = work.u_dot_new[low:high]
     for i in range(rates.size):
         rates[i] = work.free[(low + i) // 2, i % 2]
     for i in range(work.counts[pad]):
         node = work.touched[first + i]
         for r in range(2):
-            row = row_of(rig.condensed_C, start, 2 * (node - first) + r, size)
+            row = rig.condensed_C[row_of(rig, pad, 2 * (node - first) + r)]
             add(scale * work.F_new[node, r], row[low - 2 * first :], rates)
 
 
@@ -127,9 +135,9 @@ def propose(rig: Any, work: Any, pad: int, a: float) -> None:
 def quadratic(rig: Any, pad: int, x: Array, low: int, high: int) -> float:
     """x C x of a vector of surface dofs that is zero but from `low` to `high`, with the stored
     compliance C."""
-    total, size, inside = 0.0, size_of(rig, pad), x[low:high]
+    total, inside = 0.0, x[low:high]
     for m in range(inside.size):
-        row = row_of(rig.condensed_C, rig.condensed_C_start[pad], low + m, size)
+        row = rig.condensed_C[row_of(rig, pad, low + m)]
         total += inside[m] * dot(inside, row[low:])
     return total
 
@@ -197,9 +205,9 @@ def find_span(rig: Any, pad: int, y: Array, dy: Array, span: Array) -> None:
 
 @compiled
 def push(
-    rig: Any, work: Any, tangents: Any, pad: int, y: Array, dy: Array, dp: Array, a: float
+    rig: Any, work: Any, along: Any, pad: int, y: Array, dy: Array, dp: Array, a: float
 ) -> None:
-    """Derivatives of u* (tangents.u) and of u' before the forces' own change (tangents.v) at the
+    """Derivatives of u* (along.u) and of u' before the forces' own change (along.rate) at the
     touched nodes."""
     p, first, start, m = rig.p, rig.pad_node_start[pad], rig.pad_y_start[pad], dy.shape[1]
     size, chain, branches = (
@@ -207,71 +215,66 @@ def push(
         rig.condensed_chain_at[pad],
         rig.condensed_branches[pad],
     )
-    material, span, du, dv = chain + 2 * branches, tangents.span, tangents.u, tangents.v
+    material, span, du, dv = chain + 2 * branches, along.span, along.u, along.rate
     left = min(span[pad, 0], 2 * (work.low[pad] - first))
     right = max(span[pad, 1], 2 * (work.high[pad] - first))
     span[pad, 0], span[pad, 1] = left, right
-    zeta, rate, dzeta, drate = tangents.zeta, tangents.rate, tangents.dzeta, tangents.drate
-    zeta[:], rate[:], dzeta[:], drate[:] = 0.0, 0.0, 0.0, 0.0
+    zeta, z_dot, dzeta, dz_dot = along.zeta, along.z_dot, along.dzeta, along.dz_dot
+    zeta[:], z_dot[:], dzeta[:], dz_dot[:] = 0.0, 0.0, 0.0, 0.0
     for b in range(branches):
         J, rest, at = p[chain + b], p[chain + branches + b] + a, start + b * size
         for i in range(left, right):
-            z_dot = branch_rate(rig, work, pad, b, i, work.F, y, a)
+            rate = branch_rate(rig, work, pad, b, i, work.F, y, a)
             zeta[i] += J * y[at + i]
-            rate[i] += J * z_dot
+            z_dot[i] += J * rate
             add(J, dy[at + i], dzeta[i])
             add(y[at + i], dp[chain + b], dzeta[i])
-            add(z_dot, dp[chain + b], drate[i])
-            add(-J / rest, dy[at + i], drate[i])
-            add(-J / rest * z_dot, dp[chain + branches + b], drate[i])
+            add(rate, dp[chain + b], dz_dot[i])
+            add(-J / rest, dy[at + i], dz_dot[i])
+            add(-J / rest * rate, dp[chain + branches + b], dz_dot[i])
     stiffer, soft = False, softness(rig, pad)
     for k in range(m):
         stiffer |= dp[material + 1, k] != 0.0
     for i in range(left, right):  # C is proportional to the material's first entry
         add(zeta[i] / p[material], dp[material], dzeta[i])
-        add(rate[i] / p[material], dp[material], drate[i])
+        add(z_dot[i] / p[material], dp[material], dz_dot[i])
     for i in range(work.counts[pad]):
         node = work.touched[first + i]
         for r in range(2):
             dof = 2 * (node - first) + r
-            row = row_of(rig.condensed_C, rig.condensed_C_start[pad], dof, size)
+            row = rig.condensed_C[row_of(rig, pad, dof)]
             u, v = du[node, r], dv[node, r]
             u[:], v[:] = 0.0, 0.0
             for j in range(left, right):
                 add(soft * row[j], dzeta[j], u)
-                add(soft * row[j], drate[j], v)
+                add(soft * row[j], dz_dot[j], v)
             if stiffer:
-                row = row_of(rig.condensed_dC, rig.condensed_C_start[pad], dof, size)[left:right]
+                row = rig.condensed_dC[row_of(rig, pad, dof)][left:right]
                 add(soft * dot(row, zeta[left:]), dp[material + 1], u)
-                add(soft * dot(row, rate[left:]), dp[material + 1], v)
+                add(soft * dot(row, z_dot[left:]), dp[material + 1], v)
 
 
 @compiled
-def push_rates(rig: Any, work: Any, tangents: Any, pad: int, a: float, X: Array) -> None:
-    """Tangents of the touched nodes' rates, less tangents.v, under those of the nodal forces X."""
-    first, n, size, scale = (
-        rig.pad_node_start[pad],
-        work.counts[pad],
-        size_of(rig, pad),
-        mobility(rig, pad, a),
-    )
+def push_rates(rig: Any, work: Any, along: Any, pad: int, a: float, X: Array) -> None:
+    """Tangents of the touched nodes' rates, less along.rate, under those of the nodal forces X."""
+    first, n, scale = rig.pad_node_start[pad], work.counts[pad], mobility(rig, pad, a)
     for i in range(n):
         for o in range(2):
             dof = 2 * (work.touched[first + i] - first) + o
-            row = row_of(rig.condensed_C, rig.condensed_C_start[pad], dof, size)
+            row = rig.condensed_C[row_of(rig, pad, dof)]
             for j in range(n):
                 for q in range(2):
                     c = scale * row[2 * (work.touched[first + j] - first) + q]
-                    add(c, X[2 * j + q], tangents.own_rate[i, o])
+                    add(c, X[2 * j + q], along.own_rate[i, o])
 
 
 @compiled
 def push_state(
-    rig: Any, work: Any, tangents: Any, pad: int, y: Array, a: float, X: Array, dy: Array, dp: Array
+    rig: Any, work: Any, along: Any, pad: int, y: Array, a: float, X: Array, dy: Array, dp: Array
 ) -> None:
     """Tangents of the state at the stage's end."""
     first, size, start = rig.pad_node_start[pad], size_of(rig, pad), rig.pad_y_start[pad]
-    chain, branches, span = rig.condensed_chain_at[pad], rig.condensed_branches[pad], tangents.span
+    chain, branches, span = rig.condensed_chain_at[pad], rig.condensed_branches[pad], along.span
     for b in range(branches):
         part, first_z = a / (rig.p[chain + branches + b] + a), start + b * size
         for i in range(span[pad, 0], span[pad, 1]):
@@ -288,46 +291,48 @@ def push_state(
 
 
 @compiled
-def pull_forces(rig: Any, work: Any, pad: int, y_bar: Array, a: float, b: Array, X: Array) -> None:
-    """Cotangents of the touched nodes' forces into X[:, 0], from those of the state and of the
-    nodal rates, b."""
+def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: float) -> None:
+    """Cotangents of the touched nodes' forces into the first column of work.X, from those of the
+    state and of the nodes' rates, along.own_rate."""
     first, size = rig.pad_node_start[pad], size_of(rig, pad)
     chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
+    rate_bar = along.by_rate[: AXES * work.counts[pad]]
+    put(along.own_rate[: work.counts[pad]], rate_bar)
     for i in range(work.counts[pad]):
-        for r in range(2):
-            dof, total = 2 * (work.touched[first + i] - first) + r, dot(b, work.P[2 * i + r])
+        for r in range(AXES):
+            dof = AXES * (work.touched[first + i] - first) + r
+            total = dot(rate_bar, work.P[AXES * i + r])
             for branch in range(branches):
-                z_bar = y_bar[rig.pad_y_start[pad] + branch * size + dof]
+                z_bar = y_bar[rig.pad_y_start[pad] + branch * size + dof, 0]
                 total += a * z_bar / (rig.p[chain + branches + branch] + a)
-            X[2 * i + r, 0] = total
+            work.X[AXES * (first + i) + r, 0] = total
 
 
 @compiled
 def pull_state(
-    rig: Any, work: Any, scratch: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array
+    rig: Any, work: Any, along: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array
 ) -> None:
     """Cotangents of the state at the stage's start and of the material, from those of the nodal
-    rates and displacements, `scratch.rate` and `scratch.u`."""
-    p, first, start = rig.p, rig.pad_node_start[pad], rig.pad_y_start[pad]
-    size, start_C = size_of(rig, pad), rig.condensed_C_start[pad]
+    rates and displacements, along.rate and along.u."""
+    p, first, start, size = rig.p, rig.pad_node_start[pad], rig.pad_y_start[pad], size_of(rig, pad)
     chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
     material, soft = chain + 2 * branches, softness(rig, pad)
-    by_rate, by_u = scratch.surface[0], scratch.surface[1]
-    zeta, z_dot = scratch.surface[2], scratch.surface[3]
-    scratch.surface[:, :size] = 0.0
+    zeta, z_dot = along.zeta[:size], along.z_dot[:size]
+    by_u, by_rate = along.by_u[:size], along.by_rate[:size]
+    zeta[:], z_dot[:], by_u[:], by_rate[:] = 0.0, 0.0, 0.0, 0.0
     for node in range(work.low[pad], work.high[pad]):
-        for r in range(2):
-            c, d = soft * scratch.rate[node, r], soft * scratch.u[node, r]
+        for r in range(AXES):
+            c, d = soft * along.rate[node, r, 0], soft * along.u[node, r, 0]
             if c != 0.0 or d != 0.0:
-                row = row_of(rig.condensed_C, start_C, 2 * (node - first) + r, size)
-                add(c, row, by_rate[:size])
-                add(d, row, by_u[:size])
+                row = rig.condensed_C[row_of(rig, pad, AXES * (node - first) + r)]
+                add(c, row, by_rate)
+                add(d, row, by_u)
     scale_bar, left, right = 0.0, size, 0
     for b in range(branches):
         J, rest, z = p[chain + b], p[chain + branches + b] + a, start + b * size
         J_bar = tau_bar = 0.0
         for m in range(size):
-            total = (a * y_bar[z + m] + J * by_rate[m]) / rest
+            total = (a * y_bar[z + m, 0] + J * by_rate[m]) / rest
             rate = branch_rate(rig, work, pad, b, m, work.F, y, a)
             if abs(rate) * rest > NEGLIGIBLE or abs(y[z + m]) > NEGLIGIBLE:
                 left, right = min(left, m), m + 1 if m + 1 > right else right
@@ -335,14 +340,14 @@ def pull_state(
                 z_dot[m] += J * rate
                 J_bar += by_rate[m] * rate + by_u[m] * y[z + m]
                 tau_bar -= total * rate
-            y_bar[z + m] += J * by_u[m] - total
-        p_bar[chain + b] += J_bar
-        p_bar[chain + branches + b] += tau_bar
+            y_bar[z + m, 0] += J * by_u[m] - total
+        p_bar[chain + b, 0] += J_bar
+        p_bar[chain + branches + b, 0] += tau_bar
         scale_bar += J * J_bar
-    p_bar[material] += scale_bar / p[material]
+    p_bar[material, 0] += scale_bar / p[material]
     for node in range(work.low[pad], work.high[pad]):
-        for r in range(2):
-            c, d = soft * scratch.rate[node, r], soft * scratch.u[node, r]
+        for r in range(AXES):
+            c, d = soft * along.rate[node, r, 0], soft * along.u[node, r, 0]
             if c != 0.0 or d != 0.0:
-                row = row_of(rig.condensed_dC, start_C, 2 * (node - first) + r, size)[left:right]
-                p_bar[material + 1] += c * dot(row, z_dot[left:]) + d * dot(row, zeta[left:])
+                row = rig.condensed_dC[row_of(rig, pad, AXES * (node - first) + r)][left:right]
+                p_bar[material + 1, 0] += c * dot(row, z_dot[left:]) + d * dot(row, zeta[left:])

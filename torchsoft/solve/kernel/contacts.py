@@ -18,7 +18,7 @@ S by positions, H by rates of the stage, which move positions by a h.
 from typing import Any
 
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.arrays import MOTION, WRENCH
+from torchsoft.solve.kernel.arrays import AXES, MOTION, PAIR, WRENCH
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 from torchsoft.solve.kernel.linear import add, bounds, put, solve_dense
 from torchsoft.solve.kernel.table import Array
@@ -28,9 +28,9 @@ from torchsoft.solve.kernel.table import Array
 def relate(rig: Any, work: Any, c: int, derivatives: bool) -> None:
     """Relative motion of contact c and its loads under the wrench in work.pair[c]."""
     x = work.pair[c]
-    for i in range(6):
+    for i in range(PAIR):
         coordinate = rig.contact_coordinate[c, i]
-        x[i], x[6 + i] = work.q[coordinate], work.V[coordinate]
+        x[i], x[PAIR + i] = work.q[coordinate], work.V[coordinate]
     if derivatives:
         call_linearise(rig.contact_relative_linearise, x, rig.p, work.relative[c], work.by_pair[c])
     else:
@@ -41,14 +41,14 @@ def relate(rig: Any, work: Any, c: int, derivatives: bool) -> None:
 def relate_all(rig: Any, work: Any) -> None:
     """The same of all contacts, without a wrench."""
     for c in range(rig.contact_pad.size):
-        work.pair[c, 12:] = 0.0
+        work.pair[c, 2 * PAIR :] = 0.0
         relate(rig, work, c, False)
 
 
 @compiled
 def load(rig: Any, work: Any, c: int) -> None:
     """Sum of the points' wrenches on the pad of contact c into work.pair[c]."""
-    at, wrench = rig.pad_point_start[rig.contact_pad[c]], work.pair[c, 12:]
+    at, wrench = rig.pad_point_start[rig.contact_pad[c]], work.pair[c, 2 * PAIR :]
     wrench[:] = 0.0
     for i in range(at, at + work.actives[rig.contact_pad[c]]):
         if rig.point_contact[work.active[i]] == c:
@@ -118,10 +118,25 @@ def by_state(rig: Any, work: Any, k: int, r: int, j: int) -> float:
 
 
 @compiled
-def outputs(rig: Any, c: int, felt: bool) -> int:
+def outputs(rig: Any, c: int, recorded: bool) -> int:
     """Number of differentiated outputs of a contact's law: those that a stage needs, or with the
-    normal and the friction force that are felt."""
-    return WRENCH + rig.contact_states[c] + (2 if felt else 0)
+    normal and the friction force that are recorded."""
+    return WRENCH + rig.contact_states[c] + (AXES if recorded else 0)
+
+
+@compiled
+def wrench_at(rig: Any, pad: int) -> int:
+    """Place of a pad's force and moment in what is recorded."""
+    return AXES * rig.point_contact.size + WRENCH * pad
+
+
+@compiled
+def load_at(rig: Any, c: int, o: int) -> int:
+    """Place of the load on coordinate o of contact c in what is recorded; -1 for the place of a
+    base whose pad has inertia, which is moved by the forces of its elements."""
+    if rig.nodal_v_start[rig.contact_pad[c]] >= 0 and PAIR // 2 <= o < PAIR // 2 + AXES:
+        return -1
+    return wrench_at(rig, rig.pad_base.size) + rig.contact_coordinate[c, o]
 
 
 @compiled
@@ -152,13 +167,13 @@ def combine(J: Array, by: Array, out: Array) -> None:
     """Derivatives (6,) of an output by a contact's coordinates, from its row J (10,) of derivatives
     by a point's motion, and from those of the relative motion, rows of `by`."""
     x, y, theta, x_dot, y_dot, theta_dot = J[2], J[3], J[4], J[7], J[8], J[9]
-    for j in range(6):
+    for j in range(PAIR):
         position = x * by[0, j] + y * by[1, j] + theta * by[2, j]
         out[j] = position + x_dot * by[3, j] + y_dot * by[4, j] + theta_dot * by[5, j]
 
 
 @compiled
-def linearise(rig: Any, work: Any, pad: int, a: float, felt: bool) -> None:
+def linearise(rig: Any, work: Any, pad: int, a: float, recorded: bool) -> None:
     """The law at the touching points of a pad with its derivatives, H, and the contacts' loads with
     theirs."""
     at = rig.pad_point_start[pad]
@@ -173,28 +188,28 @@ def linearise(rig: Any, work: Any, pad: int, a: float, felt: bool) -> None:
         load(rig, work, c)
         relate(rig, work, c, True)
         J = work.by_pair[c]
-        for i in range(6):
-            for j in range(6):
-                work.by_stage[c, i, j] = J[i, 6 + j] + a * J[i, j]
+        for i in range(PAIR):
+            for j in range(PAIR):
+                work.by_stage[c, i, j] = J[i, PAIR + j] + a * J[i, j]
     for i in range(at, at + work.actives[pad]):
         k = work.active[i]
         c = rig.point_contact[k]
         columns, stage, own = MOTION + rig.contact_states[c], work.by_stage[c], work.J[k]
-        for o in range(outputs(rig, c, felt)):
+        for o in range(outputs(rig, c, recorded)):
             J, H = own[o * columns : o * columns + MOTION], work.H[i, o]
             H[0], H[1] = J[5] + a * J[0], J[6] + a * J[1]
             combine(J, stage, H[2:])
 
 
 @compiled
-def by_positions(rig: Any, work: Any, pad: int, felt: bool) -> None:
+def by_positions(rig: Any, work: Any, pad: int, recorded: bool) -> None:
     """S of the touching points of a pad; needs `linearise`."""
     at = rig.pad_point_start[pad]
     for i in range(at, at + work.actives[pad]):
         k = work.active[i]
         c = rig.point_contact[k]
         columns, by = MOTION + rig.contact_states[c], work.by_pair[c]
-        for o in range(outputs(rig, c, felt)):
+        for o in range(outputs(rig, c, recorded)):
             J, S = work.J[k, o * columns : o * columns + MOTION], work.S[i, o]
             S[0], S[1] = J[0], J[1]
             combine(J, by, S[2:])
@@ -229,10 +244,10 @@ def assemble(rig: Any, work: Any, pad: int, a: float, Rv: Array) -> None:
         A[i, : 2 * n] = 0.0
         A[i, i] = 1.0
     for c in range(rig.contact_pad.size):
-        for row in range(6 if rig.contact_pad[c] == pad else 0):
-            for other in range(6):
+        for row in range(PAIR if rig.contact_pad[c] == pad else 0):
+            for other in range(PAIR):
                 if rig.contact_number[c, row] >= 0 and rig.contact_number[c, other] >= 0:
-                    by = a * work.by_pair[c, 6 + row, other]
+                    by = a * work.by_pair[c, PAIR + row, other]
                     Rv[rig.contact_number[c, row], rig.contact_number[c, other]] += by
     for i in range(work.actives[pad]):
         k = work.active[at + i]
@@ -245,17 +260,17 @@ def assemble(rig: Any, work: Any, pad: int, a: float, Rv: Array) -> None:
                 row = 2 * work.slot[rig.point_node[k, j]]
                 for r in range(2):
                     add(N, P[row + r], PB[r, : 2 * n])
-        for row in range(6):
+        for row in range(PAIR):
             if number[row] < 0:
                 continue
-            down = work.by_pair[c, 6 + row, 12:]
-            for m in range(8):
+            down = work.by_pair[c, PAIR + row, 2 * PAIR :]
+            for m in range(AXES + PAIR):
                 K[row, m] = down[0] * H[0, m] + down[1] * H[1, m] + down[2] * H[2, m]
             for r in range(2):
                 add(K[row, r], PB[r], Rf[column[number[row]], : 2 * n])
-            for other in range(6):
+            for other in range(PAIR):
                 if number[other] >= 0:
-                    Rv[number[row], number[other]] += K[row, 2 + other]
+                    Rv[number[row], number[other]] += K[row, AXES + other]
         for j in range(2):
             N = rig.point_N[k, j]
             if N == 0.0:
@@ -264,9 +279,9 @@ def assemble(rig: Any, work: Any, pad: int, a: float, Rv: Array) -> None:
             for r in range(2):
                 for q in range(2):
                     add(-N * H[r, q], PB[q], A[row + r, : 2 * n])
-                for other in range(6):
+                for other in range(PAIR):
                     if number[other] >= 0:
-                        Hc[row + r, column[number[other]]] += N * H[r, 2 + other]
+                        Hc[row + r, column[number[other]]] += N * H[r, AXES + other]
 
 
 @compiled
@@ -276,9 +291,9 @@ def residual(rig: Any, work: Any, pad: int, r: Array) -> None:
     b = work.X[2 * first : 2 * (first + n)]
     b[:, 0] = 0.0
     for c in range(rig.contact_pad.size):
-        for row in range(6 if rig.contact_pad[c] == pad else 0):
+        for row in range(PAIR if rig.contact_pad[c] == pad else 0):
             if rig.contact_number[c, row] >= 0:
-                r[rig.contact_number[c, row], 0] += work.relative[c, 6 + row]
+                r[rig.contact_number[c, row], 0] += work.relative[c, PAIR + row]
     for i in range(work.actives[pad]):
         k = work.active[at + i]
         c, H = rig.point_contact[k], work.H[at + i]
@@ -295,9 +310,9 @@ def residual(rig: Any, work: Any, pad: int, r: Array) -> None:
                     b[row + o, 0] += rig.point_N[k, j] * f
         for o in range(WRENCH):
             change = H[o, 0] * dx + H[o, 1] * dy
-            for row in range(6):
+            for row in range(PAIR):
                 if rig.contact_number[c, row] >= 0:
-                    down = work.by_pair[c, 6 + row, 12 + o]
+                    down = work.by_pair[c, PAIR + row, 2 * PAIR + o]
                     r[rig.contact_number[c, row], 0] += down * change
 
 
@@ -347,7 +362,7 @@ def load_nodes(rig: Any, work: Any, pad: int, m: int, dV: Array) -> None:
 
 
 @compiled
-def fade(rig: Any, work: Any, k: int, y: Array, a: float) -> None:
+def out_of_contact(rig: Any, work: Any, k: int, y: Array, a: float) -> None:
     """The law at point k away from contact into work.decay, with work.decay_J by its states."""
     c, x = rig.point_contact[k], work.decay_x
     n = rig.contact_states[c]
@@ -386,7 +401,7 @@ def finish(rig: Any, work: Any, pad: int, y: Array, a: float, powers: Array, wre
         elif rests(rig, k, y):
             work.k[rig.point_y_start[k]] = 0.0
         else:
-            fade(rig, work, k, y, a)
+            out_of_contact(rig, work, k, y, a)
             for j in range(n):
                 work.k[state_at(rig, k, j)] = work.decay[j]
             powers[count] += work.decay[n]
@@ -415,12 +430,12 @@ def loads(rig: Any, work: Any) -> None:
     for c in range(rig.contact_pad.size):
         load(rig, work, c)
         relate(rig, work, c, False)
-        for row in range(6):
-            work.load[rig.contact_coordinate[c, row]] += work.relative[c, 6 + row]
+        for row in range(PAIR):
+            work.load[rig.contact_coordinate[c, row]] += work.relative[c, PAIR + row]
 
 
 @compiled
-def restore(rig: Any, work: Any, tape: Any, row: int, a: float, felt: bool) -> None:
+def restore(rig: Any, work: Any, tape: Any, row: int, a: float, recorded: bool) -> None:
     """A stage from the tape: coordinates, touching points with their laws' derivatives, touched
     nodes and nodal forces (work.F)."""
     put(tape.q[row], work.q)
@@ -445,8 +460,8 @@ def restore(rig: Any, work: Any, tape: Any, row: int, a: float, felt: bool) -> N
             fill(rig, work, k, tape.y[row], a)
             work.active[at + i] = k
             slot += 1
-        linearise(rig, work, pad, a, felt)
+        linearise(rig, work, pad, a, recorded)
         for i in range(at, at + work.actives[pad]):
             press(rig, work, work.active[i])
-        by_positions(rig, work, pad, felt)
+        by_positions(rig, work, pad, recorded)
         touched_nodes(rig, work, pad)

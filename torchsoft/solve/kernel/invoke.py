@@ -1,11 +1,11 @@
 """Calls of a compiled law from numba functions, by address: no allocation, no Python, no lock.
 
-`call_value(address, x, p, out)`, `call_linearise(address, x, p, out, J)` and
-`call_pullback(address, x, p, w, p_bar)` can be used in any function that numba compiles, also in
-one that is cached on disk: an address is an ordinary integer argument. The arrays are C-contiguous
-float64 arrays of any number of dimensions, as long as the law reads and writes; their sizes are not
-checked, and an array that is written must not overlap another. An argument of another type is a
-numba TypingError.
+`call_value(address, x, p, out)`, `call_linearise(address, x, p, out, J)`, `call_push(address, x, p,
+d, out)` and `call_pull(address, x, p, w, p_bar)` can be used in any function that numba compiles,
+also in one that is cached on disk: an address is an ordinary integer argument. The arrays are
+C-contiguous float64 arrays of any number of dimensions, as long as the law reads and writes; their
+sizes are not checked, and an array that is written must not overlap another. An argument of another
+type is a numba TypingError.
 """
 
 from typing import Any
@@ -48,7 +48,7 @@ def _linearise(typingctx, address, x, p, out, J):
     return _call(address, x, p, out, J)
 
 
-def _pullback(typingctx, address, x, p, w, p_bar):
+def _pull(typingctx, address, x, p, w, p_bar):
     """Adds Σ w[o]·∂out[o]/∂p[j] to p_bar[j]."""
     return _call(address, x, p, w, p_bar)
 
@@ -60,5 +60,5 @@ def _push(typingctx, address, x, p, d, out):
 
 call_value: Any = intrinsic(_value)
 call_linearise: Any = intrinsic(_linearise)
-call_pullback: Any = intrinsic(_pullback)
+call_pull: Any = intrinsic(_pull)
 call_push: Any = intrinsic(_push)

@@ -4,7 +4,7 @@ Inner loops run over views from 0 on: an index that might be negative, as Python
 loop from being vectorised.
 """
 
-from torchsoft.solve.kernel import compiled, inlined
+from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.table import Array
 
 
@@ -20,6 +20,17 @@ def add(factor: float, x: Array, out: Array) -> None:
     """Add a multiple of a vector to another one, of out's length."""
     for i in range(out.size):
         out[i] += factor * x[i]
+
+
+@compiled
+def carry(factor: float, x: Array, y: Array, back: bool) -> None:
+    """Add a multiple of vector x to y, or `back` of y to x: the transpose."""
+    if back and x.size == 1:  # without the cost of a loop
+        x[0] += factor * y[0]
+    elif back:
+        add(factor, y, x)
+    else:
+        add(factor, x, y)
 
 
 @compiled
@@ -58,12 +69,6 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
             add(-A[k, i], b[i], right)
         for j in range(m):
             right[j] *= inverse
-
-
-@inlined
-def row_of(matrices: Array, start: int, i: int, size: int) -> Array:
-    """Row i of the matrix with rows of `size` that begins at `start`, a view."""
-    return matrices[start + i * size : start + (i + 1) * size]
 
 
 @compiled

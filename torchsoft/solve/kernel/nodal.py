@@ -12,16 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled, inlined
-from torchsoft.solve.kernel.arrays import FIELD, LANES
+from torchsoft.solve.kernel import compiled, contacts
+from torchsoft.solve.kernel.arrays import AXES, LANES, PAIR, WRENCH
 from torchsoft.solve.kernel.invoke import (
     call_linearise,
-    call_pullback,
+    call_pull,
     call_push,
     call_value,
 )
 from torchsoft.solve.kernel.linear import (
     add,
+    carry,
     dot,
     factor_banded,
     put,
@@ -142,12 +143,12 @@ def evaluate(rig: Any, work: Any, pad: int, y: Array, a: float) -> tuple[float, 
     return worst, squares
 
 
-@inlined
-def matrix(rig: Any, work: Any, pad: int) -> Array:
-    """A of a pad, a view."""
+@compiled
+def matrix_of(rig: Any, pad: int) -> slice:
+    """Place of a pad's A in work.band."""
     n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
     at = rig.nodal_band_start[pad]
-    return work.band[at : at + n * (2 * rig.nodal_band[pad] + 1)]
+    return slice(at, at + n * (2 * rig.nodal_band[pad] + 1))
 
 
 @compiled
@@ -160,7 +161,9 @@ def strained(rig: Any, work: Any, g: int, a: float) -> float:
         for c in range(corners):
             off = abs(x[c, lane] - held[c, lane])
             off += a * abs(x[corners + c, lane] - held[corners + c, lane])
-            total += off * abs(x[2 * corners + c % FIELD, lane])  # gradients at the centre
+            total += off * abs(
+                x[2 * corners + c % rig.nodal_field, lane]
+            )  # gradients at the centre
         if not total <= worst:
             worst = total
     return worst
@@ -194,7 +197,7 @@ def relinearise(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
 def factor(rig: Any, work: Any, pad: int, a: float) -> None:
     """A of a pad, factorised, in work.band, from the elements' derivatives."""
     first, last, band = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.nodal_band[pad]
-    width, A, corners = 2 * band + 1, matrix(rig, work, pad), rig.nodal_dof.shape[1]
+    width, A, corners = 2 * band + 1, work.band[matrix_of(rig, pad)], rig.nodal_dof.shape[1]
     A[:] = 0.0
     for e in range(rig.nodal_element_start[pad], rig.nodal_element_start[pad + 1]):
         J, lane = work.element_J[e // LANES], e % LANES
@@ -214,13 +217,13 @@ def factor(rig: Any, work: Any, pad: int, a: float) -> None:
 def solve(rig: Any, work: Any, pad: int, b: Array, m: int, first: int) -> None:
     """A^-1 of m right-hand sides b (dofs m,), zero before dof `first`, in place."""
     n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
-    solve_banded(matrix(rig, work, pad), n, rig.nodal_band[pad], b, m, first)
+    solve_banded(work.band[matrix_of(rig, pad)], n, rig.nodal_band[pad], b, m, first)
 
 
 @compiled
 def solve_back(rig: Any, work: Any, pad: int, b: Array) -> None:
     """A^-T of b (dofs,) in place."""
-    solve_transposed(matrix(rig, work, pad), b.size, rig.nodal_band[pad], b)
+    solve_transposed(work.band[matrix_of(rig, pad)], b.size, rig.nodal_band[pad], b)
 
 
 @compiled
@@ -239,7 +242,7 @@ def relation(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
         same &= work.touched[i] == work.held_touched[i]
     if not same:
         respond(rig, work, pad, a)
-    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
+    b, m = work.responses[responses_of(rig, work, pad)], responses_width(rig, work, pad)
     for j in range(2 * n):
         dof = rig.nodal_surface[2 * work.touched[nodes + j // 2] + j % 2]
         put(b[dof * m : dof * m + 2 * n], work.P[j, : 2 * n])
@@ -262,12 +265,12 @@ def responses_width(rig: Any, work: Any, pad: int) -> int:
     return 2 * work.held_count[pad] + (2 if inertial(rig, pad) else 0)
 
 
-@inlined
-def responses(rig: Any, work: Any, pad: int) -> Array:
-    """Held responses of a pad's dofs, row by row, a view."""
+@compiled
+def responses_of(rig: Any, work: Any, pad: int) -> slice:
+    """Place of the held responses of a pad's dofs, row by row, in work.responses."""
     n = rig.nodal_dof_start[pad + 1] - rig.nodal_dof_start[pad]
     at = rig.nodal_dof_start[pad] * (work.responses.size // rig.nodal_dof_start[-1])
-    return work.responses[at : at + n * responses_width(rig, work, pad)]
+    return slice(at, at + n * responses_width(rig, work, pad))
 
 
 @compiled
@@ -281,7 +284,7 @@ def respond(rig: Any, work: Any, pad: int, a: float) -> None:
     n, moved = work.counts[pad], 2 if inertial(rig, pad) else 0
     work.held_count[pad] = n
     put(work.touched[nodes : nodes + n], work.held_touched[nodes : nodes + n])
-    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
+    b, m = work.responses[responses_of(rig, work, pad)], responses_width(rig, work, pad)
     b[:] = 0.0
     for i in range(last - first if moved else 0):
         M = mass_rate(rig, pad, first + i, a)
@@ -335,11 +338,11 @@ def couple(rig: Any, work: Any, pad: int, Rv: Array) -> None:
                         work.Hc[row + r, column] -= rig.point_N[k, j] * (
                             H[r, 0] * Dx + H[r, 1] * Dy
                         )
-            for row in range(6):
+            for row in range(PAIR):
                 number = rig.contact_number[c, row]
                 if number >= 0:
-                    down = work.by_pair[c, 6 + row, 12:]
-                    for o in range(3):
+                    down = work.by_pair[c, PAIR + row, 2 * PAIR :]
+                    for o in range(WRENCH):
                         Rv[number, towards] -= down[o] * (H[o, 0] * Dx + H[o, 1] * Dy)
         for m in range(2 * work.counts[pad]):
             node = work.touched[rig.pad_node_start[pad] + m // 2]
@@ -385,7 +388,7 @@ def propose(rig: Any, work: Any, pad: int, dV: Array) -> None:
     for i in range(work.counts[pad]):
         node = work.touched[rig.pad_node_start[pad] + i]
         forces[2 * i], forces[2 * i + 1] = work.F_new[node, 0], work.F_new[node, 1]
-    b, m = responses(rig, work, pad), responses_width(rig, work, pad)
+    b, m = work.responses[responses_of(rig, work, pad)], responses_width(rig, work, pad)
     x, y = 0.0, 0.0
     if inertial(rig, pad):
         x = dV[free[base]] if free[base] >= 0 else 0.0
@@ -443,282 +446,216 @@ def finish(
 
 
 @compiled
-def push_elements(
-    rig: Any,
-    work: Any,
-    tangents: Any,
-    pad: int,
-    du: Array,
-    dv: Array,
-    dp: Array,
-    rates: bool,
-    out: Array,
-) -> None:
-    """Add the tangents of the elements' forces to `out` (all dofs, m): by displacements du (dofs,
-    m), by the parameters, and with `rates` by rates dv (all dofs, m)."""
-    own, i0, m = element_parameters(rig, pad), rig.nodal_dof_start[pad], dp.shape[1]
-    d, (low, high) = tangents.direction[: own.stop - own.start], groups(rig, pad)
-    corners = rig.nodal_dof.shape[1]
+def carry_elements(
+    rig: Any, work: Any, along: Any, pad: int, factor: float, du: Array, drate: Array, dp: Array,
+    out: Array, back: bool,
+) -> None:  # fmt: skip
+    """Add the derivatives of the elements' forces, times a factor, to `out` (all dofs, columns): by
+    displacements du (dofs, columns), by rates (all dofs, columns, or none) and by the parameters;
+    or `back`."""
+    own, i0, (low, high) = element_parameters(rig, pad), rig.nodal_dof_start[pad], groups(rig, pad)
+    corners, direction, force = rig.nodal_dof.shape[1], along.direction, along.element
     for g in range(low, high):
         J, dofs = work.element_J[g], rig.nodal_dof[g * LANES : (g + 1) * LANES]
         for lane in range(LANES):
             for c in range(corners):
                 row = dofs[lane, c]
-                for e in range(corners if row >= 0 else 0):
-                    dof = dofs[lane, e]
+                for d in range(corners if row >= 0 else 0):
+                    dof = dofs[lane, d]
                     if dof >= 0:
-                        add(J[c, e, lane], du[dof], out[i0 + row])
-                        if rates:
-                            add(J[c, corners + e, lane], dv[i0 + dof], out[i0 + row])
-    for k in range(m):
-        moved = False
-        for j in range(d.size):
-            d[j] = dp[own.start + j, k]
-            moved |= d[j] != 0.0
+                        carry(factor * J[c, d, lane], du[dof], out[i0 + row], back)
+                        if drate.shape[0] > 0:
+                            by_rate = factor * J[c, corners + d, lane]
+                            carry(by_rate, drate[i0 + dof], out[i0 + row], back)
+    direction = along.direction[: own.stop - own.start]
+    for k in range(dp.shape[1]):
+        moved = back
+        for j in range(direction.size):
+            direction[j] = dp[own.start + j, k]
+            moved |= direction[j] != 0.0
         for g in range(low, high if moved else low):
-            call_push(rig.nodal_push[pad], work.element_x[g], rig.p[own], d, tangents.element)
+            if not back:
+                call_push(rig.nodal_push[pad], work.element_x[g], rig.p[own], direction, force)
             for lane in range(LANES):
                 for c in range(corners):
-                    row = rig.nodal_dof[g * LANES + lane, c]
-                    if row >= 0:
-                        out[i0 + row, k] += tangents.element[c, lane]
+                    dof = rig.nodal_dof[g * LANES + lane, c]
+                    if back:
+                        force[c, lane] = factor * out[i0 + dof, k] if dof >= 0 else 0.0
+                    elif dof >= 0:
+                        out[i0 + dof, k] += factor * force[c, lane]
+            if back:
+                call_pull(rig.nodal_pull[pad], work.element_x[g], rig.p[own], force, dp[own])
 
 
 @compiled
 def push(
-    rig: Any, work: Any, tangents: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, r: Array
+    rig: Any, work: Any, along: Any, pad: int, y: Array, dy: Array, dp: Array, a: float
 ) -> None:
-    """Derivatives of u* (tangents.u) and of u' before the forces' own change (tangents.v) at the
-    touched nodes, tangents.free of all of them, and the base's reaction in r."""
+    """Derivatives of u* (along.u) and of u' before the forces' own change (along.rate) at the
+    touched nodes, along.free of all of them, and the base's reaction in along.r."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
-    U, W, m, free = rig.pad_y_start[pad], rig.nodal_v_start[pad], dy.shape[1], tangents.free
+    U, W, m, free = rig.pad_y_start[pad], rig.nodal_v_start[pad], dy.shape[1], along.free
     vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
     du, at = dy[U : U + last - first], rig.nodal_density_at[pad]
     free[first:last] = 0.0
-    push_elements(rig, work, tangents, pad, du, free, dp, False, free)
-    for i in range(first, last):
-        for k in range(m):
-            free[i, k] = -free[i, k]
-        if inertial(rig, pad):
-            change = change_of_speed(rig, work, pad, i, y, vx if i % 2 == 0 else vy)
-            add(mass_rate(rig, pad, i, a), dy[W + i - first], free[i])
-            add(-rig.nodal_area[i] / a * change, dp[at], free[i])
+    carry_elements(rig, work, along, pad, -1.0, du, along.rate_of[:0], dp, free, False)
+    for i in range(first, last if inertial(rig, pad) else first):
+        change = change_of_speed(rig, work, pad, i, y, vx if i % 2 == 0 else vy)
+        add(mass_rate(rig, pad, i, a), dy[W + i - first], free[i])
+        add(-rig.nodal_area[i] / a * change, dp[at], free[i])
     b = work.solves[: (last - first) * m]
-    for i in range(last - first):
-        put(free[first + i], b[i * m : (i + 1) * m])
+    put(free[first:last], b)
     solve(rig, work, pad, b, m, 0)
-    for i in range(last - first):
-        put(b[i * m : (i + 1) * m], free[first + i])
+    put(b, free[first:last])
     for i in range(work.counts[pad]):
         node = work.touched[rig.pad_node_start[pad] + i]
-        for axis in range(2):
-            dof = rig.nodal_surface[2 * node + axis]
-            put(du[dof], tangents.u[node, axis])
-            put(free[first + dof], tangents.v[node, axis])
+        for axis in range(AXES):
+            dof = rig.nodal_surface[AXES * node + axis]
+            put(du[dof], along.u[node, axis])
+            put(free[first + dof], along.rate[node, axis])
     for k in range(m if inertial(rig, pad) else 0):
-        along = across = 0.0
+        reaction = along.reaction[0]
+        reaction[:] = 0.0
         for i in range(first, last):
             change = change_of_speed(rig, work, pad, i, y, vx if i % 2 == 0 else vy)
-            M = mass_rate(rig, pad, i, a)
-            push = (
-                M * (free[i, k] - dy[W + i - first, k]) + rig.nodal_area[i] / a * change * dp[at, k]
-            )
-            if i % 2 == 0:
-                along += push
-            else:
-                across += push
-        X, Y = to_world(work, base, along, across)
+            reaction[i % 2] += mass_rate(rig, pad, i, a) * (free[i, k] - dy[W + i - first, k])
+            reaction[i % 2] += rig.nodal_area[i] / a * change * dp[at, k]
+        X, Y = to_world(work, base, reaction[0], reaction[1])
         if rig.body_free[base] >= 0:
-            r[rig.body_free[base], k] -= X
+            along.r[rig.body_free[base], k] -= X
         if rig.body_free[base + 1] >= 0:
-            r[rig.body_free[base + 1], k] -= Y
+            along.r[rig.body_free[base + 1], k] -= Y
 
 
 @compiled
-def push_rates(rig: Any, work: Any, tangents: Any, pad: int, X: Array, m: int) -> None:
-    """Tangents of all nodes' rates, tangents.rate_of, under those of the nodal forces X, and
-    tangents.own_rate of the touched nodes, less tangents.v."""
+def push_rates(rig: Any, work: Any, along: Any, pad: int, X: Array, m: int) -> None:
+    """Tangents of all nodes' rates, along.rate_of, under those of the nodal forces X, and
+    along.own_rate of the touched nodes, less along.rate."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
     nodes = rig.pad_node_start[pad]
-    tangents.base_rate[:] = 0.0
-    for axis in range(2 if inertial(rig, pad) else 0):
-        number = rig.body_free[base + axis]
-        if number >= 0:
-            ex, ey = to_base(work, base, 1.0 - axis, axis)
-            add(ex, tangents.V[number], tangents.base_rate[0])
-            add(ey, tangents.V[number], tangents.base_rate[1])
+    along.base_rate[:] = 0.0
+    for axis in range(AXES if inertial(rig, pad) else 0):
+        ex, ey = to_base(work, base, 1.0 - axis, axis)
+        add(ex, along.V[base + axis], along.base_rate[0])
+        add(ey, along.V[base + axis], along.base_rate[1])
     b = work.solves[: (last - first) * m]
     b[:] = 0.0
     for i in range(work.counts[pad]):
-        for o in range(2):
-            dof = rig.nodal_surface[2 * work.touched[nodes + i] + o]
-            put(X[2 * i + o, :m], b[dof * m : (dof + 1) * m])
+        for o in range(AXES):
+            dof = rig.nodal_surface[AXES * work.touched[nodes + i] + o]
+            put(X[AXES * i + o, :m], b[dof * m : (dof + 1) * m])
     solve(rig, work, pad, b, m, 0)
     for i in range(last - first):
-        rate = tangents.rate_of[first + i]
-        put(tangents.free[first + i], rate)
+        rate = along.rate_of[first + i]
+        put(along.free[first + i], rate)
         add(1.0, b[i * m : (i + 1) * m], rate)
-        for q in range(2 if inertial(rig, pad) else 0):
-            add(-work.D[first + i, q], tangents.base_rate[q], rate)
+        for q in range(AXES if inertial(rig, pad) else 0):
+            add(-work.D[first + i, q], along.base_rate[q], rate)
     for i in range(work.counts[pad]):
         node = work.touched[nodes + i]
-        for o in range(2):
-            put(tangents.rate_of[first + rig.nodal_surface[2 * node + o]], tangents.own_rate[i, o])
-            add(-1.0, tangents.v[node, o], tangents.own_rate[i, o])
+        for o in range(AXES):
+            put(along.rate_of[first + rig.nodal_surface[AXES * node + o]], along.own_rate[i, o])
+            add(-1.0, along.rate[node, o], along.own_rate[i, o])
 
 
 @compiled
-def push_state(rig: Any, work: Any, tangents: Any, pad: int, a: float, dy: Array) -> None:
+def push_state(rig: Any, work: Any, along: Any, pad: int, a: float, dy: Array) -> None:
     """Tangents of the state at the stage's end."""
     first, U, W = rig.nodal_dof_start[pad], rig.pad_y_start[pad], rig.nodal_v_start[pad]
     for i in range(rig.nodal_dof_start[pad + 1] - first):
-        add(a, tangents.rate_of[first + i], dy[U + i])
+        add(a, along.rate_of[first + i], dy[U + i])
         if inertial(rig, pad):
-            put(tangents.rate_of[first + i], dy[W + i])
-            add(1.0, tangents.base_rate[i % 2], dy[W + i])
+            put(along.rate_of[first + i], dy[W + i])
+            add(1.0, along.base_rate[i % 2], dy[W + i])
 
 
 @compiled
-def push_felt(
-    rig: Any, work: Any, tangents: Any, pad: int, y: Array, a: float, dy: Array, dp: Array
+def carry_recorded(
+    rig: Any, work: Any, along: Any, pad: int, dy: Array, dp: Array, back: bool
 ) -> None:
-    """Tangents of the force and the moment of the elements, and of the base's load, in
-    tangents.recorded."""
+    """The force and the moment of the elements of a pad with inertia, and its base's load, in
+    along.recorded, by the state, the nodes' rates along.rate_of and the parameters; or `back`."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
-    U, m, into, out = rig.pad_y_start[pad], dy.shape[1], tangents.recorded, tangents.free
-    wrench = 2 * rig.point_contact.size + 3 * pad
-    load = 2 * rig.point_contact.size + 3 * rig.pad_base.size + base
+    wrench, load = contacts.wrench_at(rig, pad), contacts.wrench_at(rig, rig.pad_base.size) + base
+    out, recorded = along.free, along.recorded
+    du = dy[rig.pad_y_start[pad] : rig.pad_y_start[pad] + last - first]
     out[first:last] = 0.0
-    du = dy[U : U + last - first]
-    push_elements(rig, work, tangents, pad, du, tangents.rate_of, dp, True, out)
-    for k in range(m):
-        x = z_axis = moment = 0.0
-        for i in range(first, last, 2):
-            x += out[i, k]
-            z_axis += out[i + 1, k]
-            moment += rig.nodal_X[i] * out[i + 1, k] - rig.nodal_X[i + 1] * out[i, k]
-        into[wrench, k], into[wrench + 1, k], into[wrench + 2, k] = x, z_axis, moment
-        X, Y = to_world(work, base, x, z_axis)
-        into[load, k] += X
-        into[load + 1, k] += Y
+    if not back:
+        carry_elements(rig, work, along, pad, 1.0, du, along.rate_of, dp, out, back)
+    for i in range(first, last):
+        axis = i % 2
+        arm = rig.nodal_X[i - 1] if axis == 1 else -rig.nodal_X[i + 1]
+        X, Y = to_world(work, base, 1.0 - axis, axis)
+        carry(1.0, out[i], recorded[wrench + axis], back)
+        carry(arm, out[i], recorded[wrench + AXES], back)
+        carry(X, out[i], recorded[load], back)
+        carry(Y, out[i], recorded[load + 1], back)
+    if back:
+        carry_elements(rig, work, along, pad, 1.0, du, along.rate_of, dp, out, back)
 
 
 # Adjoint.
 
 
 @compiled
-def pull_elements(
-    rig: Any, work: Any, bars: Any, pad: int, factor: float, forces_bar: Array, u_bar: Array,
-    rate_bar: Array, p_bar: Array,
-) -> None:  # fmt: skip
-    """Add to the cotangents of displacements (dofs,), of rates (all dofs,) and of the parameters
-    those of the elements' forces, `factor` forces_bar (all dofs,)."""
-    own, i0, bar = element_parameters(rig, pad), rig.nodal_dof_start[pad], bars.element
-    (low, high), corners = groups(rig, pad), rig.nodal_dof.shape[1]
-    for g in range(low, high):
-        J, dofs = work.element_J[g], rig.nodal_dof[g * LANES : (g + 1) * LANES]
-        for c in range(corners):
-            for lane in range(LANES):
-                dof = dofs[lane, c]
-                bar[c, lane] = factor * forces_bar[i0 + dof] if dof >= 0 else 0.0
-        call_pullback(rig.nodal_pullback[pad], work.element_x[g], rig.p[own], bar, p_bar[own])
-        for d in range(corners):
-            for lane in range(LANES):
-                dof = dofs[lane, d]
-                if dof >= 0:
-                    by_u = by_rate = 0.0
-                    for c in range(corners):
-                        by_u += J[c, d, lane] * bar[c, lane]
-                        by_rate += J[c, corners + d, lane] * bar[c, lane]
-                    u_bar[dof] += by_u
-                    rate_bar[i0 + dof] += by_rate
-
-
-@compiled
-def pull_felt(
-    rig: Any, work: Any, bars: Any, pad: int, y: Array, a: float, y_bar: Array, p_bar: Array
-) -> None:
-    """Adjoint of `push_felt`: the cotangents of rates go to bars.rate_of."""
+def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: float) -> None:
+    """Cotangents of the touched nodes' forces into the first column of work.X, and of the base's
+    velocity, from those of the state, of all nodes' rates and of the touched ones', along.rate_of
+    and along.own_rate."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
-    U, wrench, bar = rig.pad_y_start[pad], bars.wrenches[pad], bars.own
-    x, z_axis = to_base(work, base, bars.load[base], bars.load[base + 1])
-    for i in range(first, last, 2):
-        bar[i] = wrench[0] + x - rig.nodal_X[i + 1] * wrench[2]
-        bar[i + 1] = wrench[1] + z_axis + rig.nodal_X[i] * wrench[2]
-    pull_elements(rig, work, bars, pad, 1.0, bar, y_bar[U : U + last - first], bars.rate_of, p_bar)
-
-
-@compiled
-def pull_forces(
-    rig: Any,
-    work: Any,
-    bars: Any,
-    pad: int,
-    y_bar: Array,
-    a: float,
-    b: Array,
-    X: Array,
-    V_bar: Array,
-) -> None:
-    """Cotangents of the touched nodes' forces into X[:, 0], and of the base's velocity, from those
-    of the state and of the nodal rates, b, and bars.rate_of."""
-    first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
-    U, W, nodes, own = (
-        rig.pad_y_start[pad],
-        rig.nodal_v_start[pad],
-        rig.pad_node_start[pad],
-        bars.own,
-    )
+    U, W, nodes, bar = (
+        rig.pad_y_start[pad], rig.nodal_v_start[pad], rig.pad_node_start[pad], work.load_dof
+    )  # fmt: skip
     for i in range(first, last):
-        own[i] = bars.rate_of[i] + a * y_bar[U + i - first]
+        bar[i] = along.rate_of[i, 0] + a * y_bar[U + i - first, 0]
         if inertial(rig, pad):
-            own[i] += y_bar[W + i - first]
+            bar[i] += y_bar[W + i - first, 0]
     for i in range(work.counts[pad]):
-        for r in range(2):
-            own[first + rig.nodal_surface[2 * work.touched[nodes + i] + r]] += b[2 * i + r]
+        for r in range(AXES):
+            dof = rig.nodal_surface[AXES * work.touched[nodes + i] + r]
+            bar[first + dof] += along.own_rate[i, r, 0]
     if inertial(rig, pad):
-        reaction = bars.pair[0]
+        reaction = along.reaction[0]
         reaction[:] = 0.0
         for i in range(first, last):
-            for axis in range(2):
-                reaction[axis] -= work.D[i, axis] * own[i]
-            reaction[i % 2] += y_bar[W + i - first]
+            for axis in range(AXES):
+                reaction[axis] -= work.D[i, axis] * bar[i]
+            reaction[i % 2] += y_bar[W + i - first, 0]
         X_bar, Y_bar = to_world(work, base, reaction[0], reaction[1])
-        if rig.body_free[base] >= 0:
-            V_bar[rig.body_free[base]] += X_bar
-        if rig.body_free[base + 1] >= 0:
-            V_bar[rig.body_free[base + 1]] += Y_bar
-    solve_back(rig, work, pad, own[first:last])
+        along.V[base, 0] += X_bar
+        along.V[base + 1, 0] += Y_bar
+    solve_back(rig, work, pad, bar[first:last])
     for i in range(work.counts[pad]):
-        for r in range(2):
-            X[2 * i + r, 0] = own[first + rig.nodal_surface[2 * work.touched[nodes + i] + r]]
+        for r in range(AXES):
+            dof = rig.nodal_surface[AXES * work.touched[nodes + i] + r]
+            work.X[AXES * (nodes + i) + r, 0] = bar[first + dof]
 
 
 @compiled
 def pull_state(
-    rig: Any, work: Any, bars: Any, pad: int, y: Array, y_bar: Array, a: float, nu: Array,
-    V_bar: Array, p_bar: Array,
-) -> None:  # fmt: skip
+    rig: Any, work: Any, along: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array
+) -> None:
     """Cotangents of the state at the stage's start, of the material and of the base's velocity,
-    from those of the nodal rates and displacements, bars.rate, bars.rate_of and bars.u, and nu of
-    the bodies' equations."""
+    from those of the nodal rates and displacements, along.rate, along.rate_of and along.u, and
+    along.r of the bodies' equations."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
     U, W, at = rig.pad_y_start[pad], rig.nodal_v_start[pad], rig.nodal_density_at[pad]
-    own, reaction, local = bars.own, bars.pair[0], bars.pair[1]
-    nx = nu[rig.body_free[base], 0] if rig.body_free[base] >= 0 else 0.0
-    ny = nu[rig.body_free[base + 1], 0] if rig.body_free[base + 1] >= 0 else 0.0
+    bar, reaction, local = work.load_dof, along.reaction[0], along.reaction[1]
+    nx = along.r[rig.body_free[base], 0] if rig.body_free[base] >= 0 else 0.0
+    ny = along.r[rig.body_free[base + 1], 0] if rig.body_free[base + 1] >= 0 else 0.0
     reaction[0], reaction[1] = to_base(work, base, -nx, -ny)
     for i in range(first, last):
-        own[i] = bars.rate_of[i] + a * y_bar[U + i - first]
+        bar[i] = along.rate_of[i, 0] + a * y_bar[U + i - first, 0]
         if inertial(rig, pad):
-            own[i] += y_bar[W + i - first] + mass_rate(rig, pad, i, a) * reaction[i % 2]
+            bar[i] += y_bar[W + i - first, 0] + mass_rate(rig, pad, i, a) * reaction[i % 2]
     for node in range(work.low[pad], work.high[pad]):
-        for r in range(2):
-            own[first + rig.nodal_surface[2 * node + r]] += bars.rate[node, r]
-            y_bar[U + rig.nodal_surface[2 * node + r]] += bars.u[node, r]
-    solve_back(rig, work, pad, own[first:last])  # now the multiplier of the pad's equation
-    # the rates' cotangents are spent: what comes to them here is not read
-    pull_elements(rig, work, bars, pad, -1.0, own, y_bar[U : U + last - first], bars.rate_of, p_bar)
+        for r in range(AXES):
+            bar[first + rig.nodal_surface[AXES * node + r]] += along.rate[node, r, 0]
+            y_bar[U + rig.nodal_surface[AXES * node + r], 0] += along.u[node, r, 0]
+    solve_back(rig, work, pad, bar[first:last])  # now the multiplier of the pad's equation
+    put(bar[first:last], along.free[first:last])
+    u_bar, none = y_bar[U : U + last - first], along.rate_of[:0]
+    carry_elements(rig, work, along, pad, -1.0, u_bar, none, p_bar, along.free, True)
     if not inertial(rig, pad):
         return
     vx, vy = to_base(work, base, work.V[base], work.V[base + 1])
@@ -726,10 +663,10 @@ def pull_state(
     for i in range(first, last):
         M = mass_rate(rig, pad, i, a)
         change = change_of_speed(rig, work, pad, i, y, vx if i % 2 == 0 else vy)
-        balance = M * (reaction[i % 2] - own[i])
-        local[i % 2] += y_bar[W + i - first] + balance
-        p_bar[at] += rig.nodal_area[i] / a * change * (reaction[i % 2] - own[i])
-        y_bar[W + i - first] = -balance
+        balance = M * (reaction[i % 2] - bar[i])
+        local[i % 2] += y_bar[W + i - first, 0] + balance
+        p_bar[at, 0] += rig.nodal_area[i] / a * change * (reaction[i % 2] - bar[i])
+        y_bar[W + i - first, 0] = -balance
     X_bar, Y_bar = to_world(work, base, local[0], local[1])
-    V_bar[base] += X_bar
-    V_bar[base + 1] += Y_bar
+    along.V[base, 0] += X_bar
+    along.V[base + 1, 0] += Y_bar

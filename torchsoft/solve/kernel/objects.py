@@ -1,9 +1,9 @@
-"""Object files of the kernels: found, checked, loaded and called; made where there are none.
+"""The object file of the kernels: found, checked, loaded and called; made where there is none.
 
-An object file is named after the sources of the kernels and a level of processors, and carries its
-checksum. A file counts only if it belongs to whoever may change this program anyway. A file that
-cannot be read is compiled again, which needs numba; where nothing can be written, every start
-compiles, and says so.
+It is named after the sources of the kernels and a level of processors, and carries its checksum.
+A file counts only if it belongs to whoever may change this program anyway. A file that cannot be
+read is compiled again, which needs numba; where nothing can be written, every start compiles, and
+says so.
 """
 
 import ctypes
@@ -26,7 +26,6 @@ from typing import Any
 
 import llvmlite.binding as llvm
 from platformdirs import user_cache_path
-from tqdm import tqdm
 
 from torchsoft.files import held, replacing
 from torchsoft.solve.kernel.arrays import Backward, Forward, Rates, Run
@@ -158,11 +157,11 @@ def remove_old() -> None:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def keep(name: str, target: str, content: bytes) -> None:
-    """Store the object of an entry for a level in the first folder that can be written."""
+def keep(target: str, content: bytes) -> None:
+    """Store the object for a level in the first folder that can be written."""
     for folder in FOLDERS:
         with suppress(OSError):
-            write(folder / f"{name}-{target}.o", content)
+            write(folder / f"{target}.o", content)
             return
     note(
         f"compiled kernels cannot be kept in {' or '.join(map(str, FOLDERS))}; compiling at "
@@ -170,9 +169,9 @@ def keep(name: str, target: str, content: bytes) -> None:
     )
 
 
-def found(name: str) -> bytes | None:
-    """The object of an entry for this processor, from the first folder that has it."""
-    contents = (read(folder / f"{name}-{level()}.o") for folder in FOLDERS)
+def found() -> bytes | None:
+    """The object for this processor, from the first folder that has it."""
+    contents = (read(folder / f"{level()}.o") for folder in FOLDERS)
     return next((content for content in contents if content is not None), None)
 
 
@@ -183,9 +182,9 @@ def alone() -> Iterator[None]:
     lock = None
     for folder in FOLDERS:
         with suppress(OSError):
-            if (lock := held(folder / "compiling", 0.0)) is None:
+            while (lock := held(folder / "compiling")) is None:
                 note(f"another process compiles kernels for {folder}; waiting for it")
-                lock = held(folder / "compiling", -1.0)
+                time.sleep(0.1)
             break
     try:
         yield
@@ -194,53 +193,37 @@ def alone() -> Iterator[None]:
             lock.release()
 
 
-def build(name: str) -> bytes:
-    """The object of an entry for this processor: compiled, unless another process has just done
-    so."""
+def build() -> bytes:
+    """The object for this processor: compiled, unless another process has just done so."""
     if digest(HERE) != NAME:
         raise RuntimeError(CHANGED)
     with alone():
-        return found(name) or compile_missing(name)
+        return found() or compile_missing()
 
 
-def compile_missing(name: str) -> bytes:
-    """Compile an entry for this processor, and beside it the others that are missing and that a
-    user is likely to need, where there are processors for it; each in a process of its own."""
-    likely = [other for other in ENTRIES if other != "rates" and other != name]
-    others = [other for other in likely if found(other) is None]
-    names = [name, *others[: (os.cpu_count() or 1) - 1]]
+def compile_missing() -> bytes:
+    """Compile the object for this processor, in a process of its own."""
+    note("compiling kernels, once, in half a minute")
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "torchsoft.solve.kernel.build", "--out", folder]
-        pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-        at_work = {one: subprocess.Popen([*command, one], **pipes) for one in names}
-        note(f"compiling kernels, once: {', '.join(names)}")
-        with tqdm(total=len(names), leave=False, disable=None) as bar:
-            try:
-                while any(process.poll() is None for process in at_work.values()):
-                    time.sleep(0.1)
-                    bar.n = sum(process.poll() is not None for process in at_work.values())
-                    bar.refresh()
-            finally:
-                for process in at_work.values():
-                    process.kill()
-        for one, process in at_work.items():
-            output = process.communicate()[0]
-            if process.returncode:
-                raise RuntimeError(f"the kernel `{one}` could not be compiled: {output}")
-            path = Path(folder) / NAME / f"{one}-{level()}.o"
-            if not path.exists():
-                raise RuntimeError(CHANGED)
-            keep(one, level(), path.read_bytes())
-        return (Path(folder) / NAME / f"{name}-{level()}.o").read_bytes()
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+        if done.returncode:
+            raise RuntimeError(f"the kernels could not be compiled: {done.stdout}")
+        path = Path(folder) / NAME / f"{level()}.o"
+        if not path.exists():
+            raise RuntimeError(CHANGED)
+        content = path.read_bytes()
+    keep(level(), content)
+    return content
 
 
-def load(name: str) -> Any:
-    """An entry as a function of a table's address.
+def load() -> dict[str, Any]:
+    """The entries, by name, as functions of a table's address.
 
-    Its sections lie in one block (`use_lmm`): elsewhere they may be further apart than a relative
+    Their sections lie in one block (`use_lmm`): elsewhere they may be further apart than a relative
     address of 32 bits reaches, in a process that has loaded gigabytes of CUDA.
     """
-    content = found(name) or build(name)
+    content = found() or build()
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     if llvm.address_of_symbol("log1p") is None and (path := ctypes.util.find_library("m")):
@@ -249,12 +232,11 @@ def load(name: str) -> Any:
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine, use_lmm=True)
     engine.add_object_file(llvm.ObjectFileRef.from_data(content))
     engine.finalize_object()
+    _engines.append(engine)
     room = (ctypes.c_int64 * 1)(), (ctypes.c_int64 * 1)()  # of results and errors: there are none
     pointer = ctypes.c_void_p
     kind = ctypes.CFUNCTYPE(ctypes.c_int, pointer, pointer, ctypes.c_int64)
-    function = kind(engine.get_function_address(name))
-    _engines.append(engine)
-    return partial(function, *room)
+    return {name: partial(kind(engine.get_function_address(name)), *room) for name in ENTRIES}
 
 
 _loaded: dict[str, Any] = {}
@@ -263,11 +245,11 @@ _loading = threading.Lock()
 
 
 def call(name: str, table: Any) -> None:
-    """Run an entry on its table, without the interpreter's lock. Raises `RuntimeError` where it
-    cannot be compiled."""
-    if name not in _loaded:
+    """Run an entry on its table, without the interpreter's lock. Raises `RuntimeError` where the
+    kernels cannot be compiled."""
+    if not _loaded:
         with _loading:
-            if name not in _loaded:
-                _loaded[name] = load(name)
+            if not _loaded:
+                _loaded.update(load())
     if _loaded[name](address(table)):
         raise RuntimeError(f"the kernel `{name}` ended early")

@@ -2,7 +2,7 @@
 
 A pad is to its contacts one affine relation at every iterate, u' = free + P F - D dV_base, whatever
 its material: `begin` and `displace` a stage, `evaluate` what a trial leaves, `assemble` its block,
-`propose` and `move`, `finish`; `push_...` and `pull_...` are the tangent's and the adjoint's.
+`propose` and `move`, `finish`; `push_...` belong to the tangent, `pull_...` to the adjoint.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, condensed, contacts, nodal
 from torchsoft.solve.kernel.arrays import CONDENSED
-from torchsoft.solve.kernel.linear import add, put
+from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.table import Array
 
 
@@ -62,9 +62,9 @@ def assemble(rig: Any, work: Any, pad: int, y: Array, a: float, Rv: Array) -> No
 
 
 @compiled
-def restore(rig: Any, work: Any, tape: Any, row: int, a: float, felt: bool) -> None:
+def restore(rig: Any, work: Any, tape: Any, row: int, a: float, recorded: bool) -> None:
     """A stage from the tape, with the derivatives of the pads' materials where it ended."""
-    contacts.restore(rig, work, tape, row, a, felt)
+    contacts.restore(rig, work, tape, row, a, recorded)
     put(tape.rate[row], work.rate)
     for pad in range(rig.pad_base.size):
         if rig.pad_kind[pad] != CONDENSED:
@@ -143,81 +143,60 @@ def find_spans(rig: Any, y: Array, dy: Array, span: Array) -> None:
 
 @compiled
 def push(
-    rig: Any, work: Any, tangents: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, r: Array
+    rig: Any, work: Any, along: Any, pad: int, y: Array, dy: Array, dp: Array, a: float
 ) -> None:
-    """Derivatives of u* (tangents.u) and of u' before the forces' own change (tangents.v) at the
-    touched nodes, and the reaction of inertia on the base in r."""
+    """Derivatives of u* (along.u) and of u' before the forces' own change (along.rate) at the
+    touched nodes, and the reaction of inertia on the base in along.r."""
     if rig.pad_kind[pad] == CONDENSED:
-        condensed.push(rig, work, tangents, pad, y, dy, dp, a)
+        condensed.push(rig, work, along, pad, y, dy, dp, a)
     else:
-        nodal.push(rig, work, tangents, pad, y, dy, dp, a, r)
+        nodal.push(rig, work, along, pad, y, dy, dp, a)
 
 
 @compiled
-def push_rates(rig: Any, work: Any, tangents: Any, pad: int, a: float, m: int) -> None:
-    """Tangents of the nodal forces, in work.X, and of the touched nodes' rates less tangents.v,
-    tangents.own_rate, from the solution in work.X and tangents.V."""
+def push_rates(rig: Any, work: Any, along: Any, pad: int, a: float, columns: int) -> None:
+    """Tangents of the nodal forces, in work.X, and of the touched nodes' rates less along.rate,
+    along.own_rate, from the solution in work.X and along.dV."""
     first, n = rig.pad_node_start[pad], work.counts[pad]
     X = work.X[2 * first : 2 * (first + n)]
-    contacts.load_nodes(rig, work, pad, m, tangents.V)
-    tangents.own_rate[:n] = 0.0
+    contacts.load_nodes(rig, work, pad, columns, along.dV)
+    along.own_rate[:n] = 0.0
     if rig.pad_kind[pad] == CONDENSED:
-        condensed.push_rates(rig, work, tangents, pad, a, X)
+        condensed.push_rates(rig, work, along, pad, a, X)
     else:
-        nodal.push_rates(rig, work, tangents, pad, X, m)
+        nodal.push_rates(rig, work, along, pad, X, columns)
 
 
 @compiled
 def push_state(
-    rig: Any, work: Any, tangents: Any, pad: int, y: Array, a: float, dy: Array, dp: Array
+    rig: Any, work: Any, along: Any, pad: int, y: Array, a: float, dy: Array, dp: Array
 ) -> None:
     """Tangents of the pad's state at the stage's end, after `push_rates`."""
     if rig.pad_kind[pad] == CONDENSED:
         first = rig.pad_node_start[pad]
         X = work.X[2 * first : 2 * (first + work.counts[pad])]
-        condensed.push_state(rig, work, tangents, pad, y, a, X, dy, dp)
+        condensed.push_state(rig, work, along, pad, y, a, X, dy, dp)
     else:
-        nodal.push_state(rig, work, tangents, pad, a, dy)
+        nodal.push_state(rig, work, along, pad, a, dy)
 
 
 @compiled
-def pull_forces(
-    rig: Any, work: Any, bars: Any, pad: int, y_bar: Array, a: float, V_bar: Array, felt: bool
-) -> None:
-    """Cotangents of the touched nodes' forces into the first column of work.X, from those of the
-    pad's state and of the law's outputs at the touching points, bars.out; those of the velocities
-    are added to V_bar."""
-    at, b, by = rig.pad_point_start[pad], bars.surface[0, : 2 * work.counts[pad]], bars.by
-    b[:] = 0.0
-    for i in range(at, at + work.actives[pad]):
-        k = work.active[i]
-        c = rig.point_contact[k]
-        by[:] = 0.0
-        for r in range(contacts.outputs(rig, c, felt)):
-            add(bars.out[k, r], work.H[i, r], by)
-        for j in range(2):
-            if rig.point_N[k, j] != 0.0:
-                row = 2 * work.slot[rig.point_node[k, j]]
-                add(rig.point_N[k, j], by, b[row : row + 2])
-        for row in range(6):
-            if rig.contact_number[c, row] >= 0:
-                V_bar[rig.contact_number[c, row]] += by[2 + row]
-    first = rig.pad_node_start[pad]
-    X = work.X[2 * first : 2 * (first + work.counts[pad])]
+def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: float) -> None:
+    """Cotangents of the touched nodes' forces into the first column of work.X, and of the base's
+    velocity, from those of the pad's state and of the touched nodes' rates, along.own_rate."""
     if rig.pad_kind[pad] == CONDENSED:
-        condensed.pull_forces(rig, work, pad, y_bar, a, b, X)
+        condensed.pull_forces(rig, work, along, pad, y_bar, a)
     else:
-        nodal.pull_forces(rig, work, bars, pad, y_bar, a, b, X, V_bar)
+        nodal.pull_forces(rig, work, along, pad, y_bar, a)
 
 
 @compiled
 def pull_state(
-    rig: Any, work: Any, bars: Any, pad: int, y: Array, y_bar: Array, a: float, nu: Array,
-    V_bar: Array, p_bar: Array,
-) -> None:  # fmt: skip
+    rig: Any, work: Any, along: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array
+) -> None:
     """Cotangents of the pad's state at the stage's start and of its material, from those of the
-    nodal rates and displacements, bars.rate and bars.u."""
+    nodal rates and displacements, along.rate and along.u."""
     if rig.pad_kind[pad] == CONDENSED:
-        condensed.pull_state(rig, work, bars, pad, y, y_bar, a, p_bar)
+        condensed.pull_state(rig, work, along, pad, y, y_bar, a, p_bar)
     else:
-        nodal.pull_state(rig, work, bars, pad, y, y_bar, a, nu, V_bar, p_bar)
+        nodal.pull_state(rig, work, along, pad, y, y_bar, a, p_bar)

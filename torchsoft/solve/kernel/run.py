@@ -280,7 +280,7 @@ def rates(call: Any) -> None:
     )
     put(work.k, out)
     for i in range(rig.source_pushed.size):
-        work.load[rig.source_pushed[i]] += effort(rig, work, i, y, call.signals[0], AT_ONCE)
+        work.load[rig.source_pushed[i]] += effort(rig, work, i, AT_ONCE)
     for i in range(rig.body_coordinate.size):
         load = work.load[rig.body_coordinate[i]]
         out[rig.body_V_start + i] = load / rig.p[rig.body_mass_at[i]]  # (17), (18)

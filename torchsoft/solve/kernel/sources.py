@@ -11,55 +11,44 @@ from torchsoft.solve.kernel.table import Array
 
 
 @compiled
-def effort(rig: Any, work: Any, i: int, y: Array, signals: Array, a: float) -> float:
-    """Effort [N or N.m] of source i at the end of a stage from y; work.effort receives it and the
-    rates of its states, work.effort_x the signals that it reads with their rates, the coordinates
-    with theirs, its states and a, work.effort_J derivatives by all but a, row by row."""
-    x, n = work.effort_x, 0
-    for k in range(rig.source_signal_start[i], rig.source_signal_start[i + 1]):
-        x[n], x[n + 1] = signals[rig.source_signal[k], 0], signals[rig.source_signal[k], 1]
-        n += 2
-    for k in range(rig.source_coordinate_start[i], rig.source_coordinate_start[i + 1]):
-        x[n], x[n + 1] = work.q[rig.source_coordinate[k]], work.V[rig.source_coordinate[k]]
-        n += 2
-    for k in range(rig.source_states[i]):
-        x[n] = y[rig.source_y_start[i] + k]
-        n += 1
-    x[n] = a
+def read(rig: Any, work: Any, y: Array, signals: Array) -> None:
+    """Put signals and states of sources where sources read them, beside positions and velocities,
+    in work.ports."""
+    put(signals, work.ports[: signals.size])
+    for i in range(signals.size + 2 * work.q.size, work.ports.size):
+        work.ports[i] = y[rig.port_y[i]]
+
+
+@compiled
+def effort(rig: Any, work: Any, i: int, a: float) -> float:
+    """Effort [N or N.m] of source i at the end of a stage; work.effort receives it and the rates of
+    its states, work.effort_x what it reads and a, work.effort_J derivatives by all but a, row by
+    row. Needs `read`."""
+    inputs, x = rig.source_input[bounds(rig.source_input_start, i)], work.effort_x
+    for j in range(inputs.size):
+        x[j] = work.ports[inputs[j]]
+    x[inputs.size] = a
     own = rig.p[bounds(rig.source_p_start, i)]
     call_linearise(rig.source_linearise[i], x, own, work.effort, work.effort_J)
     return work.effort[0]
 
 
 @compiled
-def first_coordinate(rig: Any, i: int) -> int:
-    """Place of the first coordinate among the inputs of source i."""
-    return 2 * (rig.source_signal_start[i + 1] - rig.source_signal_start[i])
-
-
-@compiled
-def first_state(rig: Any, i: int) -> int:
-    """Place of the first state among the inputs of source i."""
-    coordinates = rig.source_coordinate_start[i + 1] - rig.source_coordinate_start[i]
-    return first_coordinate(rig, i) + 2 * coordinates
-
-
-@compiled
-def push(rig: Any, work: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
+def drive(rig: Any, work: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
     """Efforts of the sources on the free coordinates, r (free, 1), and their derivative by the
     velocities of a stage of length a, Rv."""
     Rv[:], r[:] = 0.0, 0.0
+    read(rig, work, y, signals)
     for i in range(rig.source_pushed.size):
         number = rig.body_free[rig.source_pushed[i]]
         if number < 0:
             continue
-        r[number, 0] += effort(rig, work, i, y, signals, a)  # (32), (34)
-        n = first_coordinate(rig, i)
-        for k in range(rig.source_coordinate_start[i], rig.source_coordinate_start[i + 1]):
-            towards = rig.body_free[rig.source_coordinate[k]]
-            if towards >= 0:
-                Rv[number, towards] += a * work.effort_J[n] + work.effort_J[n + 1]
-            n += 2
+        r[number, 0] += effort(rig, work, i, a)  # (32), (34)
+        inputs = rig.source_input[bounds(rig.source_input_start, i)]
+        for j in range(inputs.size):
+            towards = rig.port_number[inputs[j]]
+            if towards >= 0:  # a position, and next its velocity
+                Rv[number, towards] += a * work.effort_J[j] + work.effort_J[j + 1]
 
 
 @compiled
@@ -74,26 +63,24 @@ def resist(rig: Any, work: Any, y: Array, a: float, r: Array, Rv: Array) -> None
 @compiled
 def balance(rig: Any, work: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
     """Efforts of the sources less M V', r (free, 1), and their derivative by the velocities, Rv."""
-    push(rig, work, y, signals, a, r, Rv)
+    drive(rig, work, y, signals, a, r, Rv)
     resist(rig, work, y, a, r, Rv)
 
 
 @compiled
-def remember(rig: Any, work: Any, y: Array, signals: Array, a: float) -> None:
-    """Rates of the sources' states into work.k."""
+def keep_states(rig: Any, work: Any, a: float) -> None:
+    """Rates of the sources' states into work.k; needs `read`."""
     for i in range(rig.source_pushed.size):
         first, states = rig.source_y_start[i], rig.source_states[i]
         if states > 0:
-            effort(rig, work, i, y, signals, a)
+            effort(rig, work, i, a)
             put(work.effort[1 : 1 + states], work.k[first : first + states])
 
 
 @compiled
-def supply(
-    rig: Any, work: Any, y: Array, signals: Array, a: float, powers: Array, first: int
-) -> None:
+def supply(rig: Any, work: Any, a: float, powers: Array, first: int) -> None:
     """Powers [W] of the sources and of the drives of bodies, from `first` on, and the sum of the
-    positive ones, last."""
+    positive ones, last; needs `read`."""
     powers[first:] = 0.0
     bodies = rig.body_free.size // 3 - 1
     drive = powers.size - 1 - bodies
@@ -103,7 +90,7 @@ def supply(
                 powers[drive + b] -= work.load[c] * work.V[c]
     for i in range(rig.source_pushed.size):
         c = rig.source_pushed[i]
-        power = effort(rig, work, i, y, signals, a) * work.V[c]
+        power = effort(rig, work, i, a) * work.V[c]
         powers[first + rig.source_power[i]] += power
         if rig.body_free[c] < 0:  # what pushes a driven coordinate is held by what drives it
             powers[drive + c // 3] -= power

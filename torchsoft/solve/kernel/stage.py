@@ -10,7 +10,7 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, contacts, pads
 from torchsoft.solve.kernel.linear import put, solve_dense
-from torchsoft.solve.kernel.sources import push, remember, resist
+from torchsoft.solve.kernel.sources import drive, keep_states, resist
 from torchsoft.solve.kernel.table import Array
 
 SEARCH_AFTER, SHORTEST = 2, 2.0**-10
@@ -23,7 +23,7 @@ step lessens it."""
 
 
 @compiled
-def drive(rig: Any, work: Any, y: Array, signals: Array, a: float) -> None:
+def place_bodies(rig: Any, work: Any, y: Array, signals: Array, a: float) -> None:
     """All coordinates at the end of the stage: those of the state for the free velocities in V,
     signals for the others."""
     q, V = work.q, work.V
@@ -84,7 +84,7 @@ def solve_stage(
     sources with their derivatives. Returns success and the number of linear solves.
     """
     count, free = rig.pad_base.size, rig.body_coordinate.size
-    drive(rig, work, y, signals, a)
+    place_bodies(rig, work, y, signals, a)
     for pad in range(count):
         pads.begin(rig, work, pad, y, a)
     if not work.travelled[0] <= work.travelled[1]:  # also where they are no numbers yet
@@ -101,7 +101,7 @@ def solve_stage(
             contacts.evaluate(rig, work, pad, y, a)
             worst, total = pads.evaluate(rig, work, pad, y, a)
             mismatch, squares = worst if not worst <= mismatch else mismatch, squares + total
-        push(rig, work, y, signals, a, r, Rv)
+        drive(rig, work, y, signals, a, r, Rv)
         if iteration > 0:
             worst, total = beyond_linear(work, part)
             mismatch, squares = worst if not worst <= mismatch else mismatch, squares + total
@@ -114,7 +114,7 @@ def solve_stage(
             for i in range(free):
                 c = rig.body_coordinate[i]
                 work.V[c] = V_old[c] + part * dV[i]
-            drive(rig, work, y, signals, a)
+            place_bodies(rig, work, y, signals, a)
             continue
         if iteration > 0 and mismatch <= limits.tolerance:
             return True, iteration
@@ -142,14 +142,12 @@ def solve_stage(
             pads.move(rig, work, pad, 1.0)
         for i in range(free):
             work.V[rig.body_coordinate[i]] += dV[i]
-        drive(rig, work, y, signals, a)
+        place_bodies(rig, work, y, signals, a)
         previous, part, iteration = squares, 1.0, iteration + 1
 
 
 @compiled
-def finish(
-    rig: Any, work: Any, y: Array, signals: Array, a: float, powers: Array, wrenches: Array
-) -> float:
+def finish(rig: Any, work: Any, y: Array, a: float, powers: Array, wrenches: Array) -> float:
     """All rates of the accepted stage in work.k, what the pads and contacts dissipate in `powers`
     (pads, dashpots, slip) [W], generalised forces in work.load, the force on every pad [N] and its
     moment (Eq. 35) [N.m] in its base's axes. Returns a bound of every surface speed [m/s]."""
@@ -163,7 +161,7 @@ def finish(
         c = rig.body_coordinate[i]
         work.k[rig.body_q_start + i] = work.V[c]
         work.k[rig.body_V_start + i] = (work.V[c] - y[rig.body_V_start + i]) / a
-    remember(rig, work, y, signals, a)
+    keep_states(rig, work, a)
     for c in range(rig.contact_pad.size):
         rate = work.relative[c, 3:]
         speed = np.hypot(rate[0], rate[1]) + abs(rate[2]) * rig.contact_size[c]

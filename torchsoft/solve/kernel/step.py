@@ -11,6 +11,7 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, contacts, pads, sources
 from torchsoft.solve.kernel.arrays import (
+    AXES,
     CONVERGED,
     GAMMA,
     INSTANT,
@@ -59,11 +60,11 @@ def record(rig: Any, work: Any, wrenches: Array, out: Array) -> None:
         at = rig.pad_point_start[pad]
         for i in range(work.actives[pad]):
             k = work.active[at + i]
-            felt = WRENCH + rig.contact_states[rig.point_contact[k]]
-            out[2 * k], out[2 * k + 1] = work.out[k, felt], work.out[k, felt + 1]
-    first = 2 * rig.point_contact.size
-    put(wrenches, out[first : first + wrenches.size])
-    put(work.load, out[first + wrenches.size :])
+            force = WRENCH + rig.contact_states[rig.point_contact[k]]
+            put(work.out[k, force : force + AXES], out[AXES * k : AXES * (k + 1)])
+    first, last = contacts.wrench_at(rig, 0), contacts.wrench_at(rig, rig.pad_base.size)
+    put(wrenches, out[first:last])
+    put(work.load, out[last:])
 
 
 @compiled
@@ -96,7 +97,7 @@ def solve_near(
         converged, count = solve_stage(rig, work, limits, y, signals, a, reach)
         solves += count
         if converged:
-            speed = finish(rig, work, y, signals, a, powers, wrenches)
+            speed = finish(rig, work, y, a, powers, wrenches)
             done = work.travelled[0] + a * speed <= work.travelled[1]
             if not done:  # a point may have come near that was not looked at
                 converged = reach == margin  # one look further must do
@@ -140,7 +141,7 @@ def take_step(call: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
         if tape.y.shape[0] > 0 and not write_tape(rig, work, tape, row + stage, y, 0.0):
             status = TAPE_FULL
             break
-        sources.supply(rig, work, y, signals[stage], a, powers, rig.pad_base.size + 2)
+        sources.supply(rig, work, a, powers, rig.pad_base.size + 2)
         put(work.k, taken.K[stage])
         taken.speed[stage] = speed
         dt = a if stage == 1 else h - a

@@ -1,6 +1,6 @@
-"""A rig at one moment, as the kernels take it: its model, and its parameters as one vector.
+"""The parameters of a rig at one moment, as one vector with a table of names.
 
-The parameters are copied when a run begins, so that later changes of the modules do not matter;
+They are copied when a run begins, so that later changes of the modules do not matter;
 where a derivative is wanted the vector keeps its graph, and so gradients reach the tensors that the
 values were made of.
 """
@@ -16,14 +16,10 @@ from torch import Tensor, nn
 
 from torchsoft.physics.motion import Reference, polynomial
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.structure import Copies, Structure, copied, described
+from torchsoft.physics.structure import Structure, copied, described
 from torchsoft.physics.validity import check_place, check_values, ordinary
-from torchsoft.solve.kernel import arrays
-from torchsoft.solve.kernel.arrays import Limits, scratch
-from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.model import computed, model_of, prepared_laws, prepared_shapes
-from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.steps import Followed, own_units
 
 
@@ -35,10 +31,15 @@ def independent() -> Iterator[None]:
         yield
 
 
-class Compiled:
-    """A rig at one moment, with `values` in the place of some parameters, by their id: `rig`, a
-    copy; its `model`; the vector of its parameters, as `numbers` and as `p`, with its graph where
-    it is to be `differentiable`; and the `reference`, a copy of it in that case.
+class Parameters:
+    """The parameters of a rig at one moment, with `values` in the place of some, by their id.
+
+    vector (n,): the parameters and then what is computed from them, in SI units, of which
+    `parameters["materials.rubber.E"]` is a slice (`model.places` has all names); p (m,): the same
+    in the order in which the kernels read it, `numbers` without its graph, which it has where it is
+    to be `differentiable`. rig: a copy of the rig with these parameters; model: what its structure
+    determines; reference: that of the run, a copy of it in that case; units: of `atol`
+    (`own_units`).
 
     Raises the `ValueError`s of a rig that cannot be run.
     """
@@ -54,13 +55,13 @@ class Compiled:
         differentiable = differentiable or not structure.known  # whose gradients are judged
         followed = rig.reference if reference is None else reference
         if not ordinary(given):
-            self._refuse(Copies(structure).made(given)[0], rig.reference)
+            self._refuse(structure.copy(given)[0], rig.reference)
         apart = independent() if differentiable else nullcontext()
         with torch.inference_mode(False), torch.set_grad_enabled(differentiable), apart:
             theta, mine = taken(structure.parameters, given, differentiable)
             own = [mine[id(x)] for x in structure.parameters]
             self.model = model = model_of(structure, own)
-            modules = model.copies.made(own)
+            modules = model.structure.copy(own, apart=False)
             self.rig: Rig = modules[0]
             touched = lambda one: not values.keys().isdisjoint(map(id, one.parameters()))
             change = lambda one: differentiable or (values and touched(one))
@@ -77,15 +78,15 @@ class Compiled:
         """Find the vector of parameters; the last one again for the same values without a graph."""
         model, values = self.model, theta.detach().numpy()
         if not theta.requires_grad and model.last is not None and model.shared:
-            known, self.p, self.units = model.last
+            known, self.vector, self.p, self.units = model.last
             if np.array_equal(known, values):
                 self.numbers: Array = self.p.numpy()
                 return
         if not model.within(modules, values):
             check_values(self.rig)
         made = computed(self.rig, prepared_shapes(self.rig), prepared_laws(self.rig)).values()
-        whole = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
-        self.p, self.units = whole[model.index], own_units(self.rig, model.smallest)
+        self.vector = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
+        self.p, self.units = self.vector[model.index], own_units(self.rig, model.smallest)
         self.numbers = self.p.detach().numpy()
         if not np.isfinite(self.numbers).all():
             raise ValueError(
@@ -95,7 +96,11 @@ class Compiled:
         if not model.chained(self.numbers):
             check_values(self.rig)
         if not self.p.requires_grad:
-            model.last = values, self.p, self.units
+            model.last = values, self.vector, self.p, self.units
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Values (.,) of a parameter, by its name in the module or the rig file."""
+        return self.vector[self.model.places[name]]
 
     def _refuse(self, rig: Rig, reference: Reference) -> None:
         """Raises the `ValueError` that names a parameter which is no ordinary tensor."""
@@ -132,7 +137,7 @@ class Compiled:
             raise ValueError(
                 f"the signal `{name}` of the reference is not finite at t = {time:.10g} s"
             )
-        if used.plain(self.rig.signals) is None and not torch.equal(
+        if not used.is_plain(self.rig.signals) and not torch.equal(
             followed, self.rig.follow(t, used)
         ):
             raise ValueError(
@@ -181,65 +186,3 @@ def copy_of(
                 own: dict[str, Any] = one._parameters
                 own[name] = x if x is None else mine[id(x)]
     return out  # pyright: ignore[reportReturnType]
-
-
-# The compiled right-hand side of a rig, as a function of numpy arrays, for other integrators.
-
-
-LIMITS = Limits(1e-10, 40, 2e-3)
-"""Newton's tolerance [N] and iterations, and how near [m] a point has to be to count as one that
-may touch."""
-
-
-class Rates:
-    """dy/dt = f(t, y) of a rig and its reference as they are now, compiled: tens of microseconds a
-    call.
-
-    The same as `rig.forward` to Newton's tolerance, for one state y (size,) of numpy. `calls`
-    counts. An object keeps scratch of its own and the last forces as Newton's guess: one thread may
-    call it at a time.
-
-    Raises `NotImplementedError` for inertial pads.
-    """
-
-    def __init__(self, rig: Rig, reference: Reference | None = None) -> None:
-        compiled = Compiled(rig, reference)
-        if any(pad.inertial for pad in rig.pads.values()):
-            raise NotImplementedError(
-                "the rates of inertial pads are not compiled for single states; use `rig.forward`"
-            )
-        self._system, self._limits = compiled.system, LIMITS
-        self._work = scratch("Work", self._system, compiled.layout.size, columns=1)
-        self._followed = compiled.followed(compiled.reference, 0.0)
-        self._signals = np.zeros((1, compiled.model.followed, 2))
-        self._powers, self._wrenches = (
-            np.zeros(len(compiled.model.integrals.names)),
-            np.zeros((len(rig.pads), 3)),
-        )
-        self.calls = 0
-
-    def __call__(self, t: float, y: Array) -> Array:
-        """dy/dt (size,) at t [s]. Raises `SimulationFailed` where Newton finds no forces."""
-        out, y = np.empty(len(y)), np.ascontiguousarray(y)
-        self.calls += 1
-        found = self._solve(t, y, out)
-        if not found:  # once more without the last call's guess
-            self._work.u_dot[:], self._work.rate[:] = 0.0, 0.0
-            found = self._solve(t, y, out)
-        self._followed.check()
-        if not found:
-            self._work.u_dot[:], self._work.rate[:] = 0.0, 0.0
-            raise SimulationFailed(
-                f"at t = {t:.6g} s Newton's iteration found no forces for the state", float(t)
-            )
-        return out
-
-    def _solve(self, t: float, y: Array, out: Array) -> bool:
-        """Whether Newton found the forces; the rates go to `out`."""
-        converged = np.zeros(1, np.int64)
-        table = arrays.Rates(
-            self._system, self._work, self._followed.arrays, self._limits, float(t), y,
-            self._signals, self._powers, self._wrenches, out, converged,
-        )  # fmt: skip
-        call("rates", table)
-        return bool(converged[0])
