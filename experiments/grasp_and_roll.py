@@ -22,12 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from scipy.optimize import newton
 
 from experiments.frame import COARSE, Table, options, write
-from torchsoft import BuiltRig, NoEquilibrium, Rig, RigFile, Trajectory
-from torchsoft.plot import diagram
+from torchsoft import BuiltRig, Rig, RigFile, Trajectory
 from torchsoft.plot.animation import animate, player
 from torchsoft.plot.dashboard import dashboard
+from torchsoft.plot.diagram import multibond_graph
 from torchsoft.plot.figures import (
     COLOURS,
     DESIRED,
@@ -52,8 +53,8 @@ FORCES_AT = {0.125: 14, 5.0: 15}
 SETTLE = 0.5
 """Time [s] after the grasp at which the bracket is judged to be at rest."""
 
-HELD = 1e-6
-"""Distance [m] to which the bracket is held at its height."""
+GUESS, HELD = 80.0, 0.1
+"""First guess of the grasping force, and the accuracy to which it is found [N]."""
 
 POINTS = 4
 """Contact points an element of the finer run, whose peak of F_x is within 2 % of that of eight."""
@@ -88,7 +89,7 @@ def grasping_force(file: RigFile, rtol: float) -> float:
     """Force [N] fed forward that leaves the vertical loop nothing to do once the grasp has settled.
 
     Friction locked in during the grasp stiffens the pads, so that the force of statics, "held" in a
-    rig file, is too low: the grasp itself is simulated, by the secant method.
+    rig file, is too low: the grasp itself is simulated, and the force found by the secant method.
     """
     grasp: Any = file.motion["y_d"]
     t = [0.0, grasp.times[-1], grasp.times[-1] + SETTLE]
@@ -96,18 +97,7 @@ def grasping_force(file: RigFile, rtol: float) -> float:
     def error(force: float) -> float:
         return float(pushed(file, force).run(t, rtol=rtol)["y_Br"][-1]) - grasp.values[-1]
 
-    force, off = 0.0, error(0.0)
-    gain = 2.0 * file.actuators["y"].Kp  # the pads are about as stiff as the loop
-    for _ in range(20):
-        if abs(off) <= HELD:
-            return force
-        new = force + gain * off
-        new_off = error(new)
-        gain = (new - force) / (off - new_off)
-        force, off = new, new_off
-    raise NoEquilibrium(
-        f"no grasping force found: the bracket is still {off:.2g} m off at {force:.4g} N"
-    )
+    return float(newton(error, 0.0, x1=GUESS, tol=HELD))
 
 
 def manipulate(config: Config, friction: str, changes: Mapping[str, Any]) -> Run:
@@ -226,7 +216,7 @@ def figures(run: Run) -> dict[str, Figure]:
             [t for t in FIGURE_16 if t <= trajectory.t[-1]],
             title=f"Grasp and roll, {run.friction} friction (paper: Fig. 16)",
         ),
-        "multibond": diagram.multibond_graph(run.rig),
+        "multibond": multibond_graph(run.rig),
     }
     for time, number in FORCES_AT.items():
         if time <= trajectory.t[-1]:
@@ -252,7 +242,6 @@ def main(config: Config) -> None:
     write(config, content, {"paper": table(**found)}, pictures)
     default.trajectory.save(config.out / "trajectory.nc")
     paper_like.trajectory.save(config.out / "trajectory_paper_like.nc")
-    (config.out / "multibond.dot").write_text(diagram.dot(default.rig), encoding="utf-8")
     if config.animation:
         animate(
             default.trajectory, config.out / "animation.gif", frames=12 if config.smoke else 150,

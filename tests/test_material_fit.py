@@ -382,7 +382,7 @@ WRONG: list[tuple[Mapping[str, Any], dict[str, Any], str]] = [
     ({"t [s]": COUNT, "stress [Pa]": ONES}, {}, "needs one of the columns strain, stretch"),
     (HELD | {"stretch [1]": ONES}, {}, "but has strain and stretch"),
     (TRIANGLE, {}, "has no column `t`"),
-    (HELD | {"t [s]": np.r_[COUNT[:-1], 3]}, {}, "row 22, column `t`: 3 s is not after 19 s"),
+    (HELD | {"t [s]": np.r_[COUNT[:-1], 3]}, {}, "row 22, column `t`: 3 s follows 19 s"),
     ({name: x[:5] for name, x in HELD.items()}, {}, "has 5 rows of numbers, but needs at least 8"),
     (HELD | {"strain [1]": 0 * ONES}, {}, "the strain is zero throughout"),
     (HELD | {"stress [Pa]": -ONES}, {}, "strain and stress are opposite"),

@@ -84,7 +84,7 @@ def test_slopes_are_the_differences():
     limits = {"grip": Limit(channel="effort_left_x", low=4.0, high=50.0, since=0.1)}
     objective = lambda run: run["effort_left_y"].square().mean()
     over = {"materials.silicone.E": torch.tensor([5e5, 5.2e5]).double()}
-    search = searched(free, 1e-8, over, Terms(objective, {"turn": TURN} | PLACE, limits))
+    search = searched(free, 1e-9, over, Terms(objective, {"turn": TURN} | PLACE, limits))
     evaluate, z = search.evaluator.evaluate, search.evaluator.variables.start.copy()
     z[:3] += [-0.1, 0.12, -0.05]
     found = evaluate(z)

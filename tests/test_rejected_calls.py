@@ -180,7 +180,7 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: small(contacts={"d": Contact("P", "disc", LAW)}), r"contacts\.d: .* body as `c`"),
     (lambda: small(contacts={"d": Contact("Q", "disc", LAW)}), "`d` is between `Q` and `disc`"),
     (lambda: small(pads={"P": Pad(MESH, SOFT, base="disc")}), "to the body `disc` itself"),
-    (lambda: driven(PD(1.0, 1.0), "disc.up"), r"`x` speaks of `disc\.up`, .* there are disc\.x"),
+    (lambda: driven(PD(1.0, 1.0), "disc.up"), r"`x` speaks of `disc\.up`, .*there are disc\.x"),
     (lambda: driven(PD(1.0, 1.0))(0.0, torch.zeros(33).double()), "no signal `w`; it has none"),
     (lambda: odeint(nn.Identity(), f64(0.0), T, method=METHOD), r"torchsoft\.Rig, but got Iden"),
     (lambda: odeint(m := coarse(), grasped(m), T, method=METHOD, options={"stepsize": 1e-3}),

@@ -134,6 +134,22 @@ def read(
     return Numbers(by_name, numbers, left_out, first)
 
 
+def check_complete(path: Path, table: Numbers, time: str) -> None:
+    """Raises `ValueError` for an empty cell, and for times in a column `time` that do not
+    increase."""
+    for name, column in table.values.items():
+        if (empty := np.flatnonzero(np.isnan(column))).size:
+            raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
+    times = table.values.get(time, np.empty(0))
+    if (back := np.flatnonzero(np.diff(times) <= 0)).size:
+        i = back[0]
+        raise ValueError(
+            f"{path}, row {table.rows[i + 1]}, column `{time}`: {times[i + 1]:g} s follows "
+            f"{times[i]:g} s; times must increase: sort the rows, and delete one of two at the "
+            "same time"
+        )
+
+
 def plain_body(
     lines: Sequence[str], columns: Sequence[Column | None], separator: str, comma: bool
 ) -> NDArray[np.float64] | None:

@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 from html import escape
 from pathlib import Path
 
@@ -26,25 +26,15 @@ def enumerated(names: Iterable[str]) -> str:
     )
 
 
-def ranked(name: object, known: Iterable[str]) -> list[tuple[float, float, str]]:
-    """Known names by how much they are like another one, capitals aside first, the best first."""
-
-    def alike(one: str, other: str) -> float:
-        shared = max(  # what both are in says nothing
-            (i + 1 for i, c in enumerate(one) if c == "." and other.startswith(one[: i + 1])),
-            default=0,
-        )
-        return SequenceMatcher(None, one[shared:], other[shared:]).ratio()
-
-    given = str(name)
-    every = ((alike(given.casefold(), one.casefold()), alike(given, one), one) for one in known)
-    return sorted(every, reverse=True)
+def alike(name: object, known: Iterable[str], most: int, least: float) -> list[str]:
+    """The known names, capitals aside, that are most like another one, the best first."""
+    folded = {one.casefold(): one for one in known}
+    return [folded[one] for one in get_close_matches(str(name).casefold(), folded, most, least)]
 
 
 def nearest(name: object, known: Iterable[str]) -> str | None:
     """The known name that is most like another one; None where none is."""
-    best, _, one = next(iter(ranked(name, known)), (0.0, 0.0, ""))
-    return one if best >= ALIKE else None
+    return next(iter(alike(name, known, 1, ALIKE)), None)
 
 
 def suggestion(name: object, known: Iterable[str], listed: str = "known are") -> str:
@@ -55,7 +45,7 @@ def suggestion(name: object, known: Iterable[str], listed: str = "known are") ->
     if near is None:
         return f"{listed} {enumerated(names) or 'none'}"
     many = len(names) > FEW
-    some = [one for *_, one in ranked(name, names)[:SHOWN]] + ["..."] if many else names
+    some = [*alike(name, names, SHOWN, 0.0), "..."] if many else names
     return f"did you mean `{near}`? ({listed} {', '.join(some)})"
 
 

@@ -1,7 +1,6 @@
 """Checks of drawn parameters before anything is simulated: what they are, and whether the rig file
 can have the bounds of their distributions."""
 
-import itertools
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -61,37 +60,26 @@ class Drawn(NamedTuple):
     def _check_ends(self, names: set[str]) -> None:
         """Raises `ValueError` where the rig file is impossible: as it is; with each bound of the
         distributions with these names, the other parameters as the file states them but for the
-        ratios that it is in; and with all parameters at their medians, or pairs of bounds in one
-        part or ratio and the others at their medians."""
+        ratios that it is in; and with all parameters at their medians."""
         parameters, within = self.parameters, f"{self.where}parameters"
         if reason := self._unlike({}):
             raise ValueError(f"{f'{self.where}fixed' if self.where else 'rig'}: {reason}")
-        ends = {name: one.ends(f"{within}.{name}") for name, one in parameters.items()}
-        tables = {name: place(self.file, name).keys[:2] for name in parameters}
         for name in parameters.keys() & names:
             related = {name, parameters[name].ratio_to}
             related |= {one for one in parameters if parameters[one].ratio_to == name}
-            for end in ends[name].items():
+            moves = place(self.file, name).keys[0] == "motion"
+            for where, end in parameters[name].ends(f"{within}.{name}").items():
                 values = self._values({name: end})
                 own = {one: values[one] for one in related & values.keys()}
-                if reason := self._unlike(own, moves=tables[name][0] == "motion"):
-                    raise ValueError(f"{stated({name: end})}: {reason}")
+                if reason := self._unlike(own, moves):
+                    raise ValueError(f"{where} = {end:g}: {reason}")
         if reason := self._unlike(self._values({})):
             raise ValueError(f"{within} in their middle: {reason}")
-        for one, other in itertools.combinations(parameters, 2):
-            ratio = {parameters[one].ratio_to, parameters[other].ratio_to} & {one, other}
-            in_one_part = tables[one] == tables[other] and tables[one][0] != "motion"
-            if {one, other} & names and (ratio or in_one_part):
-                for both in itertools.product(extremes(ends[one]), extremes(ends[other])):
-                    case = dict(zip((one, other), both))
-                    if reason := self._unlike(self._values(case)):
-                        raise ValueError(f"{stated(case)}: {reason}")
 
-    def _values(self, case: Mapping[str, tuple[str, float]]) -> dict[str, float]:
-        """All parameters, with those of a case at their bounds and the others at their medians."""
+    def _values(self, given: dict[str, float]) -> dict[str, float]:
+        """All parameters, some of them as given and the others at their medians."""
         middle = {name: one.at(MIDDLE) for name, one in self.parameters.items()}
-        drawn = middle | {name: value for name, (_, value) in case.items()}
-        return in_ratio(self.file, self.parameters, drawn)
+        return in_ratio(self.file, self.parameters, middle | given)
 
     def _unlike(self, values: Mapping[str, float], moves: bool = False) -> str | None:
         """The reason why the rig file cannot have these values: they are impossible, or change
@@ -105,14 +93,3 @@ class Drawn(NamedTuple):
             return f"impossible: {error}"
         change = differs(self.template, rig)
         return change and f"it changes {change}, which all trajectories share; set it in `fixed`"
-
-
-def extremes(ends: Mapping[str, float]) -> list[tuple[str, float]]:
-    """The least and the largest of some bounds."""
-    ordered = sorted(ends.items(), key=lambda end: end[1])
-    return [ordered[0], ordered[-1]]
-
-
-def stated(case: Mapping[str, tuple[str, float]]) -> str:
-    """The bounds of a case, in words."""
-    return ", ".join(f"{where} = {value:g}" for where, value in case.values())

@@ -119,17 +119,6 @@ SURE = 2.0
 """Half width of the estimated range of times, in standard errors of the mean."""
 
 
-class Log:
-    """The standard error as the file of a bar: lines in place of carriage returns."""
-
-    def write(self, text: str) -> None:
-        if text := text.strip():
-            print(text, file=sys.stderr, flush=True)
-
-    def flush(self) -> None:
-        pass
-
-
 class Part(NamedTuple):
     """Every `of`-th shard, from number - 1 on. Parts are disjoint."""
 
@@ -249,11 +238,9 @@ def generate(
     left, failed = [shard for shard in store.unfinished() if shard in mine][::-1], 0
     running = set[Future[tuple[int, int]]]()
     of = lambda shards: sum(len(config.rows(shard)) for shard in shards)
-    terminal = sys.stderr.isatty()
     with tqdm(
         total=of(mine), initial=of(mine) - of(left), unit=" trajectories", disable=not progress,
-        file=None if terminal else Log(), smoothing=0.05,
-        mininterval=0.1 if terminal else 30.0,  # [s]
+        smoothing=0.05, mininterval=0.1 if sys.stderr.isatty() else 30.0,  # [s]
     ) as bar:  # fmt: skip
         try:
             while left or running:

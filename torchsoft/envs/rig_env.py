@@ -29,7 +29,6 @@ from torchsoft.physics.channels import recorded_slices
 from torchsoft.plot.scene import Instant, Scene, instants, limits
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.built import BuiltRig
-from torchsoft.solve.diagnostics import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.trajectory import Trajectory
 
@@ -57,10 +56,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     duration: time limit [s] after `begin`, a multiple of `interval`; by default the rest of the
     file's. bounds: by coordinate such as "disc.y", beyond which an episode terminates [m, rad].
     held: bodies that terminate it when no contact touches them at a control time.
-    failure_reward: the reward of such an end, and of a failed run. judged: whether every step is
-    judged like a run of `simulate`, by its energies and the depth of its pads, in two thirds more
-    time; `info["doubts"]` then holds the faults. parameters: ranges between which each episode
-    draws numbers of the rig file by name, such as "materials.rubber.E" [Pa] or
+    failure_reward: the reward of such an end, and of a failed run. parameters: ranges between which
+    each episode draws numbers of the rig file by name, such as "materials.rubber.E" [Pa] or
     "bodies.disc.start.x" [m]; the rig is then built anew each time, which takes some tenths of a
     second.
 
@@ -76,7 +73,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
         bounds: Ranges | None = None, held: Sequence[str] = (), failure_reward: float = -1.0,
         parameters: Ranges | None = None, disturbances: Ranges | None = None, samples: int = 1,
-        judged: bool = False, render_mode: Literal["rgb_array"] | None = None,
+        render_mode: Literal["rgb_array"] | None = None,
     ) -> None:  # fmt: skip
         self._file = RigFile.from_toml(RigFile.path(rig)) if isinstance(rig, str | Path) else rig
         if not isinstance(self._file, RigFile | BuiltRig):
@@ -85,7 +82,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
                 f"{type(rig).__name__}"
             )
         self.parameters = self._checked_parameters(parameters or {})
-        self.failure_reward, self.judged = number("failure_reward", failure_reward), judged
+        self.failure_reward = number("failure_reward", failure_reward)
         built, solver = self._built({}), SOLVER
         if isinstance(self._file, RigFile):
             solver = self._file.solver.model_dump(exclude_none=True)
@@ -231,9 +228,6 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         truncated = done.moment.steps >= self.limit
         self._over = bool(ended) or truncated
         info = self._info(done.moment) | ({"ended": ended} if ended else {})
-        if self.judged:
-            found = doubts(Trajectory.of(done.solved), self.dynamics.rig)
-            info["doubts"] = list(found.values())
         reward = self.failure_reward if ended else float(done.reward)
         return self._seen(done.observation), reward, bool(ended), truncated, info
 

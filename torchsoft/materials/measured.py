@@ -458,9 +458,8 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
         raise ValueError(
             f"{path} has {len(table.rows)} rows of numbers, but needs at least {least}"
         )
+    csvfile.check_complete(path, table, "t")
     for name, column in table.values.items():
-        if (empty := np.flatnonzero(np.isnan(column))).size:
-            raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
         bad = column < 0 if name in ("modulus", "compliance") else column <= 0
         if name in POSITIVE and bad.any():
             unit = next(unit for unit, size in KNOWN[name].items() if size == 1)
@@ -469,18 +468,11 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
                 f"{column[bad.argmax()]:.4g} {unit} is not above zero: look at the signs and the "
                 "offsets of the sensors, and leave out rows of noise alone"
             )
-    if "t" not in table.values:
-        return
-    t = table.values["t"]
-    if t[0] < 0:
+    since = float(table.values.get("t", np.zeros(1))[0])
+    if since < 0:
         raise ValueError(
-            f"{path}, row {table.rows[0]}, column `t`: {t[0]:g} s is before the load; count times "
+            f"{path}, row {table.rows[0]}, column `t`: {since:g} s is before the load; count times "
             "from it"
-        )
-    if (back := np.flatnonzero(np.diff(t) <= 0)).size:
-        i = back[0] + 1
-        raise ValueError(
-            f"{path}, row {table.rows[i]}, column `t`: {t[i]:g} s is not after {t[i - 1]:g} s"
         )
 
 

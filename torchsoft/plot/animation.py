@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -22,16 +22,17 @@ from torchsoft.files import replacing, save_text
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.pads import von_mises
 from torchsoft.plot.dashboard import (
+    ACTUAL,
     RIPPLE,
-    Curve,
-    curves,
+    Chart,
+    draw,
     frame_rows,
     liveliest,
-    motion,
+    motions,
     ripples,
     sums,
 )
-from torchsoft.plot.figures import ACTUAL, COLOURS, STYLE, finish_time_axis, stress_bar
+from torchsoft.plot.figures import COLOURS, STYLE, finish_time_axis, stress_bar
 from torchsoft.plot.scene import (
     DISC,
     FRICTION,
@@ -77,7 +78,7 @@ def pace(speed: float) -> str:
     return f"\n{times:g} times {'as fast' if speed > 1 else 'slower'}"
 
 
-def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) -> Iterator[Picture]:
+def render(run: Trajectory, times: Array, dpi: int, title: str, chart: Chart) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and below it a coordinate over
     time. The axes are drawn once; each picture redraws moving parts only."""
     setup, shown = run.setup, instants(run, times.tolist())
@@ -93,7 +94,7 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) ->
         stress_bar(figure, whole, scene.stress)
         whole.set_title(title)
         figure.legend(handles=keys(setup, shown), loc="outside lower center", ncols=5)
-        motion(strip, run, curve)
+        draw(strip, run, chart)
         finish_time_axis(strip)
         (cursor,) = strip.plot([], [], "o", color=INK, ms=6)
         clock = whole.text(
@@ -107,7 +108,7 @@ def render(run: Trajectory, times: Array, dpi: int, title: str, curve: Curve) ->
     background = canvas.copy_from_bbox(figure.bbox)
     for instant, speed in zip(shown, np.diff(times, prepend=2 * times[0] - times[1])):
         scene.show(instant)
-        cursor.set_data([instant.time], [curve.values[run.at(instant.time)]])
+        cursor.set_data([instant.time], [chart.curves[ACTUAL][run.at(instant.time)]])
         clock.set_text(f"t = {instant.time:6.3f} s{pace(speed * FRAMES_PER_SECOND)}")
         canvas.restore_region(background)
         for artist in moving:
@@ -132,7 +133,7 @@ def animate(
         raise ValueError(f"`path` must end in .gif or .mp4, but is {path}")
     if path.suffix == ".mp4":
         needed("imageio_ffmpeg", "video")
-    times, known = frame_times(run, frames, slow), {curve.name: curve for curve in curves(run)}
+    times, known = frame_times(run, frames, slow), {one.name: one for one in motions(run)}
     followed = follow or liveliest(run)
     if followed not in known:
         raise ValueError(
@@ -156,7 +157,7 @@ def write_gif(pictures: Iterable[Picture], path: Path) -> None:
     images = list(map(Image.fromarray, pictures))
     middle = images[len(images) // 2].copy()
     for i, colour in enumerate(
-        (NORMAL, FRICTION, PAD, LAYER, DISC, STEEL, ACTUAL)
+        (NORMAL, FRICTION, PAD, LAYER, DISC, STEEL, COLOURS[0])
     ):  # few pixels have some of them
         middle.paste(colour, (0, 12 * i, middle.width, 12 * (i + 1)))
     palette = middle.quantize(96)
@@ -264,40 +265,29 @@ def opening(run: Trajectory, rows: list[int]) -> int:
     return int((total >= 0.5 * total.max()).argmax())
 
 
-def chart(
-    name: str, unit: str, lines: Mapping[str, tuple[Array, str]], least: float = 0.0
-) -> dict[str, Any]:
-    """Curves with one unit, of values and a colour by name. Less than `least` is drawn as zero."""
-    series = []
-    for line, (values, colour) in lines.items():
-        seen = np.where(np.abs(values) > least, values, 0.0)  # not a number is zero, too
-        series.append({"name": line, "colour": colour, "values": packed(seen)})
-    return {"name": name, "unit": unit, "series": series}
-
-
 def charts(run: Trajectory, rows: list[int]) -> list[dict[str, Any]]:
-    """All curves over the times of `rows`, in charts of one unit each. Forces of less than a
-    billionth of the largest are drawn as zero."""
-    out = []
-    for curve in curves(run):
-        name, _, unit = curve.label.rpartition(" [")
-        lines = {"actual": (curve.values[rows], COLOURS[0])}
-        if curve.setpoint is not None:
-            lines = {"set-point": (curve.setpoint[rows], "#999999")} | lines
-        out.append(chart(name, unit.rstrip("]"), lines))
+    """All curves over the times of `rows`, in charts of one unit each. Sums of forces of less than
+    a billionth of the largest are drawn as zero, and what is not a number too."""
     largest = [float(x[..., 0].detach().sum(-1).max()) for x in run.force.values()]
     least = {"N": 1e-9 * max(largest, default=0.0), "%": 1e-7}
-    for kind, (unit, series) in sums(run).items():
-        colours = zip(series.items(), COLOURS * len(series))
-        lines = {contact: (values[rows], colour) for (contact, values), colour in colours}
-        out += [chart(kind, unit, lines, least.get(unit, 0.0))] if lines else []
     shown = {one for body in run.setup.bodies.values() for one in body.channels.values()}
+    others = []
     for name, channel in run.channels.items():
         values = channel.detach().numpy()
         if name not in shown and np.abs(values).max() > 0:
-            lines = {name: (values[rows], COLOURS[0])}
-            out.append(chart(name, run.units.get(name, ""), lines))
-    return out
+            others.append(Chart(name, name, run.units.get(name, ""), {name: values}))
+    every = [(one, least.get(one.unit, 0.0)) for one in (*motions(run), *sums(run))]
+    return [
+        {
+            "name": one.label, "unit": one.unit,
+            "series": [
+                {"name": name, "colour": colour,
+                 "values": packed(np.where(np.abs(x[rows]) > floor, x[rows], 0.0))}
+                for name, x, colour in one.coloured()
+            ],
+        }
+        for one, floor in (*every, *((one, 0.0) for one in others))
+    ]  # fmt: skip
 
 
 def player(run: Trajectory, path: Path, *, frames: int = 300, title: str = "") -> None:

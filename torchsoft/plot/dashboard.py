@@ -5,7 +5,7 @@ Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, stresses
 mJ.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,9 +21,7 @@ from torchsoft.physics.energy import SLIPPING
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.pads import von_mises
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.setup import ActuatorSetup
 from torchsoft.plot.figures import (
-    ACTUAL,
     COLOURS,
     DESIRED,
     SIZES,
@@ -71,18 +69,27 @@ RIPPLE = (
 """Explanation of ripples of the forces."""
 
 
-class Curve(NamedTuple):
-    """A coordinate over the run: name, label, values (T,) in drawn units, and set-point if a loop
-    follows one."""
+SETPOINT, ACTUAL = "set-point", "actual"
+"""Names of the curves of a coordinate."""
+
+
+class Chart(NamedTuple):
+    """Curves over the run by name (T,), in one drawn unit."""
 
     name: str
     label: str
-    values: Array
-    setpoint: Array | None
+    unit: str
+    curves: dict[str, Array]
+
+    def coloured(self) -> Iterator[tuple[str, Array, str]]:
+        """Name, values and colour of every curve."""
+        colours = COLOURS * len(self.curves)
+        first = (DESIRED, *colours) if SETPOINT in self.curves else colours
+        yield from ((name, x, colour) for (name, x), colour in zip(self.curves.items(), first))
 
 
-def curves(run: Trajectory) -> Iterator[Curve]:
-    """Every coordinate that is not fixed."""
+def motions(run: Trajectory) -> Iterator[Chart]:
+    """Every coordinate that is not fixed, with its set-point if a loop follows one."""
     setpoints = {
         at: name for one in run.setup.actuators.values() for at, name in one.follows.items()
     }
@@ -91,10 +98,11 @@ def curves(run: Trajectory) -> Iterator[Curve]:
             if body.freedom[axis] == "fixed":
                 continue
             scale, unit = (1.0, "rad") if axis == "theta" else (MM, "mm")
-            coordinate, setpoint = f"{name}.{axis}", None
+            coordinate, drawn = f"{name}.{axis}", dict[str, Array]()
             if coordinate in setpoints:
-                setpoint = scale * run[setpoints[coordinate]].detach().numpy()
-            yield Curve(coordinate, f"{axis} of {name} [{unit}]", scale * place, setpoint)
+                drawn[SETPOINT] = scale * run[setpoints[coordinate]].detach().numpy()
+            drawn[ACTUAL] = scale * place
+            yield Chart(coordinate, f"{axis} of {name}", unit, drawn)
 
 
 def liveliest(run: Trajectory) -> str:
@@ -102,87 +110,72 @@ def liveliest(run: Trajectory) -> str:
     pushes if there is any."""
     looped = {one.pushes for one in run.setup.actuators.values()}
 
-    def way(curve: Curve) -> tuple[bool, float]:
-        name, _, axis = curve.name.partition(".")
+    def way(chart: Chart) -> tuple[bool, float]:
+        name, _, axis = chart.name.partition(".")
         body = run.setup.bodies[name]
         size = MM * body.size if axis == "theta" and body.size else 1.0
-        free = body.freedom[axis] == "free" and curve.name not in looped
-        return free, size * float(np.ptp(curve.values))
+        free = body.freedom[axis] == "free" and chart.name not in looped
+        return free, size * float(np.ptp(chart.curves[ACTUAL]))
 
-    return max(curves(run), key=way).name
+    return max(motions(run), key=way).name
 
 
-def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
-    """Draw a coordinate and its set-point."""
-    t = timeline(axes, curve.label, run)
-    if curve.setpoint is not None:
-        axes.plot(t, curve.setpoint, color=DESIRED, lw=3, label="set-point")
-    axes.plot(t, curve.values, color=ACTUAL, lw=1.1, label="actual")
-    if curve.setpoint is not None:
+def draw(axes: Axes, run: Trajectory, chart: Chart) -> None:
+    """Draw the curves of a chart."""
+    t = timeline(axes, f"{chart.label} [{chart.unit}]", run)
+    for name, values, colour in chart.coloured():
+        axes.plot(t, values, color=colour, lw=3 if name == SETPOINT else None, label=name)
+    if chart.name == FRICTION_SUM:
+        axes.axhline(0, color=INK, lw=0.5, zorder=1)
+    if chart.unit == "%":
+        axes.axhline(100, color=INK, lw=0.8, ls=":")
+        axes.set_ylim(0, max(108.0, 1.04 * axes.dataLim.y1))
+    if [*chart.curves] != [ACTUAL]:
         legend_above(axes)
 
 
-def sums(run: Trajectory) -> dict[str, tuple[str, dict[str, Array]]]:
-    """Sums over the points of each contact, by kind: unit, and values (T,) by contact. Kinds are
-    the forces, the used share of the friction cone (of the normal force where a law has no mu_s;
-    NaN without force), and the numbers of touching and of slipping points."""
+FRICTION_SUM, TOUCHING, SLIDING = "friction", "points in contact", "slipping"
+"""Names of some sums over the points of a contact."""
+
+
+def sums(run: Trajectory) -> list[Chart]:
+    """Sums over the points of each contact: the forces, the used share of the friction cone (of the
+    normal force where a law has no mu_s; NaN without force), and the numbers of touching and of
+    slipping points; none without contacts."""
     laws = {name: contact.friction for name, contact in run.setup.contacts.items()}
     known = all("mu_s" in law for law in laws.values())
     share_of = "friction in its cone" if known else "friction over normal force"
-    units = {
-        "normal force": "N",
-        "friction": "N",
-        share_of: "%",
-        "points in contact": "1",
-        "slipping": "1",
-    }
-    out: dict[str, tuple[str, dict[str, Array]]] = {
-        kind: (unit, {}) for kind, unit in units.items()
-    }
+    kinds = {"normal force": "N", FRICTION_SUM: "N", share_of: "%", TOUCHING: "1", SLIDING: "1"}
+    out = [Chart(kind, kind, unit, {}) for kind, unit in kinds.items()]
     for name, force in run.force.items():
         normal, friction = force.detach().unbind(-1)
         total, state = normal.sum(-1), run.contact_state[name]
         mu = laws[name]["mu_s"] if known else 1.0
         share = torch.where(total > 1e-9, 100 * friction.abs().sum(-1) / (mu * total), torch.nan)
         touching, slipping = (state != 0).sum(-1), (state == SLIPPING).sum(-1)
-        for kind, values in zip(out, (total, friction.sum(-1), share, touching, slipping)):
-            out[kind][1][name] = values.double().numpy()
-    return out
+        for one, values in zip(out, (total, friction.sum(-1), share, touching, slipping)):
+            one.curves[name] = values.double().numpy()
+    return out if run.force else []
 
 
-def contact_sums(
-    axes: Axes, run: Trajectory, kind: str, unit: str, series: Mapping[str, Array]
-) -> None:
-    """Draw one of the sums for all contacts."""
-    for (name, values), colour in zip(series.items(), COLOURS * len(series)):
-        axes.plot(timeline(axes, f"{kind} [{unit}]", run), values, color=colour, label=name)
-    if kind == "friction":
-        axes.axhline(0, color=INK, lw=0.5, zorder=1)
-    if unit == "%":
-        axes.axhline(100, color=INK, lw=0.8, ls=":")
-        axes.set_ylim(0, max(108.0, 1.04 * axes.dataLim.y1))
-    legend_above(axes)
-
-
-def points(
-    axes: Axes, run: Trajectory, touching: Mapping[str, Array], slipping: Mapping[str, Array]
-) -> None:
+def points(axes: Axes, run: Trajectory, touching: Chart, slipping: Chart) -> None:
     """Draw the number of touching points, and of slipping ones among them."""
     t = timeline(axes, "contact points", run)
-    for name, colour in zip(touching, COLOURS * len(touching)):
-        axes.step(t, touching[name], where="mid", color=colour, label=name)
-        axes.fill_between(t, 0, slipping[name], step="mid", color=colour, alpha=0.45, lw=0)
+    for name, values, colour in touching.coloured():
+        axes.step(t, values, where="mid", color=colour, label=name)
+        axes.fill_between(t, 0, slipping.curves[name], step="mid", color=colour, alpha=0.45, lw=0)
     axes.fill_between([], [], color=INK, alpha=0.45, lw=0, label="of these slip")
     axes.set_ylim(0, None)
     axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
     legend_above(axes)
 
 
-def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
-    """Draw the effort of an actuator."""
-    scale, unit = (MM, "N mm") if one.unit == "N.m" else (1.0, "N")
-    t = timeline(axes, f"on {one.pushes} [{unit}]", run)
-    axes.plot(t, scale * run[one.channel].detach().numpy(), color=ACTUAL)
+def efforts(run: Trajectory) -> Iterator[Chart]:
+    """The effort of every actuator."""
+    for one in run.setup.actuators.values():
+        scale, unit = (MM, "N mm") if one.unit == "N.m" else (1.0, "N")
+        effort = scale * run[one.channel].detach().numpy()
+        yield Chart(one.channel, f"on {one.pushes}", unit, {ACTUAL: effort})
 
 
 def frame_rows(run: Trajectory, frames: int) -> list[int]:
@@ -300,17 +293,15 @@ def panels(run: Trajectory, instant: Instant) -> dict[str, Callable[[Axes], None
     out: dict[str, Callable[[Axes], None]] = {"scene": partial(scene, run=run, instant=instant)}
     for contact in reversed(run.setup.contacts):
         out[f"contact {contact}"] = partial(cones, run=run, instant=instant, contact=contact)
-    every = list(curves(run))
-    for curve in [one for one in every if np.ptp(one.values) > STILL] or every[:1]:
-        out[curve.name] = partial(motion, run=run, curve=curve)
-    if run.force:
-        totals = sums(run)
-        touching, slipping = totals.pop("points in contact")[1], totals.pop("slipping")[1]
-        for kind, (unit, series) in totals.items():
-            out[kind] = partial(contact_sums, run=run, kind=kind, unit=unit, series=series)
-        out["points in contact"] = lambda axes: points(axes, run, touching, slipping)
-    for one in run.setup.actuators.values():
-        out[one.channel] = partial(effort, run=run, one=one)
+    every, totals = list(motions(run)), {one.name: one for one in sums(run)}
+    moving = [one for one in every if np.ptp(one.curves[ACTUAL]) > STILL] or every[:1]
+    touching, slipping = totals.pop(TOUCHING, None), totals.pop(SLIDING, None)
+    for one in (*moving, *totals.values()):
+        out[one.name] = partial(draw, run=run, chart=one)
+    if touching and slipping:
+        out[TOUCHING] = partial(points, run=run, touching=touching, slipping=slipping)
+    for one in efforts(run):
+        out[one.name] = partial(draw, run=run, chart=one)
     if run.setup.pads:
         out["stress"] = partial(stresses, run=run)
     return out | {"energy": partial(energies, run=run)}

@@ -1,8 +1,5 @@
-"""The multibond graph of the whole system as a drawing (the paper's Fig. 9) and as Graphviz text.
-
-Both come from `multibond.topology` of the rig's own ports, so they show the simulated equations of
-any rig.
-"""
+"""The multibond graph of the whole system as a drawing (the paper's Fig. 9), from
+`multibond.topology` of the rig's own ports, so that it shows the simulated equations of any rig."""
 
 import re
 
@@ -15,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from torchsoft.physics.mesh import Array
-from torchsoft.physics.multibond import to_dot, topology
+from torchsoft.physics.multibond import topology
 from torchsoft.physics.rig import Rig
 from torchsoft.plot.figures import STYLE, new_figure
 from torchsoft.plot.scene import INK
@@ -52,11 +49,6 @@ def graph_of(rig: Rig) -> nx.DiGraph:
             for k, name in enumerate(rig.bodies)
         }
         return topology(rig.evaluate(0.0, state._replace(pose=pose), signals).ports, rig.junctions)
-
-
-def dot(rig: Rig) -> str:
-    """Graphviz text of the rig's multibond graph."""
-    return to_dot(graph_of(rig))
 
 
 def is_hub(kind: str) -> bool:

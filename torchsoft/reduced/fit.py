@@ -19,7 +19,7 @@ import scipy.linalg
 from torchsoft.caller import warn
 from torchsoft.display import Shown, amount
 from torchsoft.extras import needed
-from torchsoft.reduced.ode import ReducedModel, Rollout, Term, symbol
+from torchsoft.reduced.ode import UNITS, ReducedModel, Rollout, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record
 from torchsoft.reduced.terms import Candidates
 
@@ -304,7 +304,9 @@ def _warn_of_misses(
         if name in on.series:
             error = on.columns(list(law)) @ list(law.values()) - on.series[name]
             if np.sqrt((error**2).mean()) > LAW_OFF * on.series[name].std():
-                wrong.append(f"{name} off by {amount(float(np.abs(error).max()), symbol(name)[1])}")
+                wrong.append(
+                    f"{name} off by {amount(float(np.abs(error).max()), UNITS.get(name, name))}"
+                )
     if misses[i] <= GROSS and not wrong:
         return False
     if "F_x" in model.outer:

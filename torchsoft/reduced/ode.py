@@ -1,13 +1,12 @@
 """Small ordinary differential equations y' = S y + C phi(y, u): text, torch module, and fast
 rollout.
 
-One list of terms defines the equations in text and LaTeX, the right-hand side for torchdiffeq, and
-the compiled rollout. A linear model is rolled out by an exact recursion, any other by an L-stable
+One list of terms defines the equations in text, the right-hand side for torchdiffeq, and the
+compiled rollout. A linear model is rolled out by an exact recursion, any other by an L-stable
 step: scipy's stiff solvers call Python at every step and cost more than the full simulator.
 """
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
@@ -23,13 +22,11 @@ from torchsoft.codegen import compile_law
 from torchsoft.display import Shown
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 
-SYMBOLS = {
-    "x_C": ("x_C", "m"), "theta": (r"\theta", "rad"), "x_Br": ("x_{Br}", "m"),
-    "v_C": (r"\dot x_C", "m/s"), "omega": (r"\dot\theta", "rad/s"),
-    "v_Br": (r"\dot x_{Br}", "m/s"), "F_x": ("F_x", "N"), "x_d": ("x_d", "m"),
-    "x_d_dot": (r"\dot x_d", "m/s"),
+UNITS = {
+    "x_C": "m", "theta": "rad", "x_Br": "m", "v_C": "m/s", "omega": "rad/s", "v_Br": "m/s",
+    "F_x": "N", "x_d": "m", "x_d_dot": "m/s",
 }  # fmt: skip
-"""LaTeX and unit of the variables of a reduced model."""
+"""Units of the variables of a reduced model."""
 
 BEYOND = 100.0
 """Largest state of a rollout, over the states' scale; beyond, it has diverged."""
@@ -42,11 +39,6 @@ TOLERANCE = 1e-3
 
 HALVINGS = 8
 """Most halvings of the step of a rollout."""
-
-
-def symbol(name: str) -> tuple[str, str]:
-    """LaTeX and unit of a variable; the name itself where there is no such channel."""
-    return SYMBOLS.get(name, (name, name))
 
 
 class Factor(NamedTuple):
@@ -64,13 +56,6 @@ class Term:
     text: str
     unit: str
     factors: tuple[Factor, ...]
-
-    @property
-    def latex(self) -> str:
-        """The formula with the symbols of its variables."""
-        return re.sub(
-            r"tanh|\w+", lambda m: r"\tanh" if m[0] == "tanh" else symbol(m[0])[0], self.text
-        )
 
     @property
     def linear(self) -> bool:
@@ -344,26 +329,13 @@ class ReducedModel(Shown, nn.Module):
             lines.append(f"{target}' = {body.removeprefix('+ ') or '0'}")
         return lines
 
-    def latex(self) -> str:
-        """The equations of the velocities as an `aligned` block."""
-        rows = []
-        for target, pairs in self.equations().items():
-            body = " ".join(
-                f"{'+-'[value < 0]} {_power(abs(value))}\\,{_bracketed(term.latex)}"
-                for term, value in pairs
-            )
-            rows.append(
-                rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {body.removeprefix('+ ') or '0'}"
-            )
-        return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
-
     def coefficient_table(self) -> list[dict[str, Any]]:
         """Every coefficient with its unit and, from an ensemble, its interval."""
         rows, intervals = [], self.intervals or [None] * len(self.terms)
         for target, term, value, interval in zip(
             self.targets, self.terms, self.coefficients.tolist(), intervals
         ):
-            unit = f"{symbol(target)[1]}/s per {term.unit}"
+            unit = f"{UNITS.get(target, target)}/s per {term.unit}"
             rows.append(
                 {
                     "equation": target,
@@ -384,11 +356,6 @@ def _rates(yw: Tensor, table: Table, S: Tensor, C: Tensor, K: Tensor) -> Tensor:
 
 def _bracketed(text: str) -> str:
     return f"({text})" if " + " in text or " - " in text else text
-
-
-def _power(value: float) -> str:
-    mantissa, _, exponent = f"{value:.4g}".partition("e")
-    return rf"{mantissa}\cdot 10^{{{int(exponent)}}}" if exponent else mantissa
 
 
 def linear_rollout(

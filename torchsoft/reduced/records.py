@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from torchsoft.display import Shown, amount, suggestion
-from torchsoft.reduced.ode import symbol
+from torchsoft.reduced.ode import UNITS
 from torchsoft.solve.trajectory import Trajectory
 
 STATES = ("x_C", "theta", "x_Br", "v_C", "omega", "v_Br")
@@ -63,7 +63,7 @@ class Record(Shown):
             f"{1e3 * self.step:.4g} ms"
         )
         return title, [
-            (name, f"{x.min():.4g} to {amount(float(x.max()), symbol(name)[1])}")
+            (name, f"{x.min():.4g} to {amount(float(x.max()), UNITS.get(name, name))}")
             for name, x in self.series.items()
         ]
 

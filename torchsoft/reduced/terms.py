@@ -17,7 +17,7 @@ are small differences of large positions, which is why they, and not the positio
 
 from collections.abc import Mapping, Sequence
 
-from torchsoft.reduced.ode import Factor, Term, symbol
+from torchsoft.reduced.ode import UNITS, Factor, Term
 from torchsoft.reduced.records import KINEMATICS
 
 Candidates = Mapping[str, Sequence[Term]]
@@ -33,7 +33,7 @@ def slip(text: str, **form: float) -> tuple[Term, Term]:
 
 def variable(name: str) -> Term:
     """The term of a variable itself."""
-    return Term(name, symbol(name)[1], (Factor({name: 1.0}),))
+    return Term(name, UNITS.get(name, name), (Factor({name: 1.0}),))
 
 
 def slips(r: float) -> dict[str, tuple[Term, Term]]:

@@ -23,7 +23,7 @@ from torchsoft.rigs.initial import (
     signal,
 )
 from torchsoft.rigs.naming import own_name, short_names
-from torchsoft.rigs.schema import PARTS, RigTables
+from torchsoft.rigs.schema import RigTables
 from torchsoft.solve.simulate import Initial
 from torchsoft.tables import line
 
@@ -33,25 +33,32 @@ M = TypeVar("M")
 def assemble(file: RigTables, parts: Mapping[str, Any] | None = None) -> Rig:
     """The rig without a reference; `parts` are as of `build`. Raises `ValueError` with the
     field's name for parts that are not physical."""
-    folder, left = file.folder, dict(parts or {})
+    folder, left, known = file.folder, dict(parts or {}), list[str]()
+
+    def given(name: str) -> Any:
+        known.append(name)
+        part = left.pop(name, None)
+        if isinstance(part, nn.Module):
+            check_numbers(part)
+        return part
 
     def made(group: str, build: Callable[[str, Any], M]) -> dict[str, M]:
         found = {}
         for name, table in getattr(file, group).items():
             with at_field(f"{group}.{name}"):
-                own = left.pop(f"{group}.{name}", None)
-                found[name] = sound(build(name, table) if own is None else checked(own))
+                own = given(f"{group}.{name}")
+                found[name] = sound(build(name, table) if own is None else own)
         return found
 
     def law(name: str, table: Any) -> Any:
         pressed = [pads[c.pad] for c in file.contacts.values() if c.law == name]
         with at_field("friction"):
-            friction = checked(left.pop(f"laws.{name}.friction", None))
+            friction = given(f"laws.{name}.friction")
         return table.matched_to(pressed, folder, friction)
 
     def shape(body: str) -> Any:
         with at_field("shape"):
-            return checked(left.pop(f"bodies.{body}.shape", None))
+            return given(f"bodies.{body}.shape")
 
     actuators = made("actuators", lambda _, one: one.build(folder))
     for name, one in file.controllers.items():
@@ -70,9 +77,6 @@ def assemble(file: RigTables, parts: Mapping[str, Any] | None = None) -> Rig:
         taxels=made("taxels", lambda _, one: one.build(folder)),
     )
     for name in left:
-        known = [f"{group}.{key}" for group in PARTS[:-1] for key in getattr(file, group)]
-        known += [f"laws.{key}.friction" for key in file.laws]
-        known += [f"bodies.{key}.shape" for key in file.bodies]
         raise ValueError(
             f"parts: there is no part `{line(name, 80)}` in the file; {suggestion(name, known)}"
         )
@@ -86,13 +90,6 @@ def assemble(file: RigTables, parts: Mapping[str, Any] | None = None) -> Rig:
     if not parts:
         rig.tables = file.model_dump(mode="json", exclude_unset=True)
     return rig
-
-
-def checked(part: M) -> M:
-    """A part of one's own whose numbers are in bounds. Raises `ValueError` where they are not."""
-    if isinstance(part, nn.Module):
-        check_numbers(part)
-    return part
 
 
 @single_threaded()

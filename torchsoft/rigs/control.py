@@ -4,7 +4,6 @@ coordinates.
 Networks come from files of weights, which are data and never programs.
 """
 
-import re
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -116,11 +115,7 @@ def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequ
 
 def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -> nn.Sequential:
     """Linear layers with tanh between them. Raises `ValueError` for arrays of another network."""
-    found = sorted(
-        int(name[1])
-        for name in (re.fullmatch(r"(\d{1,3})\.weight", name) for name in arrays)
-        if name
-    )
+    found = range(0, len(arrays), 2)
     if not found or {*arrays} != {f"{i}.{part}" for i in found for part in ("weight", "bias")}:
         raise ValueError(
             f"it has {', '.join(line(name, 40) for name in arrays) or 'nothing'}, but a network "

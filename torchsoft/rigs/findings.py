@@ -29,10 +29,6 @@ LINEAR = 0.25
 a contact are of that order, and there the stress of rubber deviates from linear elasticity by some
 ten per cent."""
 
-TIPPED, FLAT = 0.05, 0.1
-"""Angle [rad] from which a body with a flat face counts as tipped, and the largest curvature of a
-flat face, over that of a circle around the body."""
-
 SOFTENED = 0.05
 """Part of the give that the springs of a law may take without a note."""
 
@@ -129,8 +125,8 @@ def stopped(run: Run) -> Diagnostic:
 
 
 def strains(run: Run) -> Iterator[Diagnostic]:
-    """Findings on linear pads that are strained beyond linear elasticity, with the cause, and notes
-    on strains that are not small."""
+    """Findings on linear pads that are strained beyond linear elasticity, and notes on strains that
+    are not small."""
     for name, u in run.trajectory.displacement.items():
         pad = run.rig.pads[name]
         if isinstance(pad.material, Hyperelastic):
@@ -140,7 +136,6 @@ def strains(run: Run) -> Iterator[Diagnostic]:
         part = float(give[row, node]) / pad.mesh.height
         if part > LINEAR:
             along, across = (u[row, node].detach() @ pad.axes).abs().tolist()
-            cause = tipping(run, name, row)
             if along > across:
                 how, severity = "friction shears it by", "warning"
             else:
@@ -149,27 +144,11 @@ def strains(run: Run) -> Iterator[Diagnostic]:
             yield Diagnostic(
                 severity, f"pads.{name}",
                 f"the strain leaves linear elasticity: at t = {run.time(row):.3g} s {how} "
-                f"{part:.0%} of its height{cause}, and forces are wrong above {LINEAR:.0%}; press "
+                f"{part:.0%} of its height, and forces are wrong above {LINEAR:.0%}; press "
                 "or move less, take less friction, or a thicker or stiffer pad",
             )  # fmt: skip
         elif (strain := float(pad.largest_strain(u[row].detach().numpy()))) > SMALL_STRAIN:
             yield Diagnostic("note", f"pads.{name}", strained(strain, run.time(row)))
-
-
-def tipping(run: Run, pad: str, row: int) -> str:
-    """Clause on a body with a flat face that friction has tipped onto an edge of it by an output;
-    empty where there is none."""
-    base, poses = run.rig.pads[pad].base, run.trajectory.state.pose
-    for name, contact in run.rig.contacts.items():
-        shape = run.rig.shape_of(name)
-        if contact.pad != pad or not float(run.normal(name)[row].sum()) > 0:
-            continue
-        angle = poses[contact.body][:, 2].detach() - (0.0 if base is None else poses[base][:, 2])
-        turn = float(angle[row] - angle[0])
-        flattest = float(shape.curvature(shape.outline()).detach().min()) * shape.size()
-        if abs(turn) > TIPPED and flattest < FLAT:
-            return f", as `{contact.body}` is tipped by {np.degrees(turn):.3g} degrees onto an edge"
-    return ""
 
 
 def touches(run: Run) -> Iterator[Diagnostic]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsoft.physics.rig import Rig
 from torchsoft.plan import Bounds, Limit, Plan, Target, plan
 from torchsoft.plan.knots import Range, knots
-from torchsoft.plan.planning import RTOL, Method
+from torchsoft.plan.planning import RTOL, Method, misses
 from torchsoft.plan.problem import Terms
 from torchsoft.plan.search import SLACK
 from torchsoft.rigs.build import RigFile
@@ -117,11 +117,6 @@ def plan_file(
     return Planned(run_again(found, written, goal), written)
 
 
-SAME = 0.01
-"""Largest difference between the plan's run and that of its file, in tolerances of targets and
-scales of limits, that needs no word."""
-
-
 def run_again(found: Plan, written: RigFile, goal: Goal) -> Plan:
     """The plan, its first draw judged by a run of the file that carries it out.
 
@@ -136,18 +131,15 @@ def run_again(found: Plan, written: RigFile, goal: Goal) -> Plan:
     except (ValueError, SimulationFailed) as failure:
         reason = f"the written file cannot be run: {failure}"
         return replace(found, reached=False, reasons=(*found.reasons, reason))
-    said = list[str]()
-    for numbers, values, off in (
-        (found.errors, errors, "tolerances off"), (found.excess, excess, "of its scale beyond"),
-    ):  # fmt: skip
-        for (name, one), now in zip(numbers.items(), values):
-            if not abs(float(now - one[0])) <= SAME:
-                said.append(
-                    f"{name} is {float(now):+.3g} {off} in the run of the written file, and "
-                    f'{float(one[0]):+.3g} in the plan\'s: the file makes "rest", "held" or '
-                    '"auto" anew with what was planned; give numbers in their place'
-                )
+    found = replace(found, trajectory=run)
+    for numbers, values in ((found.errors, errors), (found.excess, excess)):
+        for one, now in zip(numbers.values(), values):
             one[0] = now
-    kept = bool((errors.abs() <= 1).all() and (excess <= SLACK).all())
-    parts = {"notices": (*found.notices, *said)} if kept else {"reasons": (*found.reasons, *said)}
-    return replace(found, trajectory=run, reached=found.reached and kept, **parts)
+    if not found.reached or bool((errors.abs() <= 1).all() and (excess <= SLACK).all()):
+        return found
+    reason = (
+        'the plan\'s own run keeps them: the file makes "rest", "held" or "auto" anew with what '
+        "was planned; give numbers in their place"
+    )
+    reasons = (*found.reasons, *misses(found.errors, found.excess), reason)
+    return replace(found, reached=False, reasons=reasons)

@@ -385,16 +385,7 @@ def read_column(
         raise ValueError(
             f"{path} has {len(times)} rows of numbers, but a motion needs two at least"
         )
-    for name, one in ((time, times), (column, values)):
-        if (empty := np.flatnonzero(np.isnan(one))).size:
-            raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
-    if (back := np.flatnonzero(np.diff(times) <= 0)).size:
-        i = back[0]
-        raise ValueError(
-            f"{path}, row {table.rows[i + 1]}, column `{time}`: {times[i + 1]:g} s follows "
-            f"{times[i]:g} s; times must increase: sort the rows, and delete one of two at the "
-            "same time"
-        )
+    csvfile.check_complete(path, table, time)
     return times.tolist(), values.tolist()
 
 

@@ -14,7 +14,6 @@ from torchsoft.display import hidden
 from torchsoft.files import make_folder, write_json
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.mesh import Mesh
-from torchsoft.physics.mesh.mesh import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
@@ -26,9 +25,6 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.tables import plain
-
-FLOPS = 1e10
-"""Floating-point operations a second [1/s] of block products on one core of a usual machine."""
 
 
 def carry_out(file: RigFile, *, progress: bool = False) -> Run:
@@ -127,14 +123,6 @@ def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, flo
     }  # fmt: skip
 
 
-def condensing_time(mesh: Mesh) -> float:
-    """Time [s] of the static condensation of a mesh to its surface: a factorisation with the
-    smallest band, and one solution for every surface coordinate."""
-    surface, free, band = mesh.counts()
-    width = max(2 * min(band, free // band), SMALLEST_BLOCK)
-    return 2 * free * width * (4 * width + 12 * surface) / FLOPS
-
-
 def cost(file: RigFile, runs: bool) -> Cost:
     """Cost of a check, and with `runs` of a run after it. Raises `ValueError` for a mesh file that
     cannot be read."""
@@ -160,7 +148,6 @@ def cost(file: RigFile, runs: bool) -> Cost:
         points = table.points * surface
         seconds += 0.5 * steps * step_time(surface, points, free if nodal else 0, finite, fields)
         memory += rows * row_bytes(fields * free if nodal else surface, points) / 2**30
-    seconds += sum(condensing_time(mesh) for mesh in set(meshes))
     return Cost(steps, seconds, memory + max(mesh.memory for mesh in meshes))
 
 
