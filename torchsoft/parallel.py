@@ -11,11 +11,11 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from contextlib import contextmanager, nullcontext
-from functools import wraps
+from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import torch
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 # Threads
 
@@ -31,6 +31,13 @@ def cores() -> int:
 
 _single: list[Any] = []
 _entering = threading.Lock()
+
+
+@lru_cache(maxsize=1)
+def controller(modules: int) -> ThreadpoolController:
+    """The libraries with threads that are loaded, when so many modules are imported: to look for
+    them takes as long as a short run."""
+    return ThreadpoolController()
 
 
 @contextmanager
@@ -67,7 +74,8 @@ def single_threaded() -> Iterator[None]:
     Sums taken by more threads round differently, and contacts that stick amplify it.
     """
     with _entering:
-        _single.append(threadpool_limits(1) if not _single else None)
+        limited = None if _single else controller(len(sys.modules)).limit(limits=1)
+        _single.append(limited)
     try:
         with one_torch_thread():
             yield
