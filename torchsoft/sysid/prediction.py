@@ -311,7 +311,7 @@ Steps = float | Frozen
 class Prediction(NamedTuple):
     """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], their derivatives (G,
     channels, n), if any, and the ends `knots` [s] of steps chosen by a tolerance; `step` is the
-    expected time of a step [s] in all runs of a varied recording, 0 for one as stated."""
+    expected time of a step [s] in a run of a changed recording, 0 for one as stated."""
 
     t: Array
     signals: Array

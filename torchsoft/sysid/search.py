@@ -73,31 +73,36 @@ HALVINGS = 10
 # A suspect becomes free
 
 
-def problem_with(problem: Problem, one: Suspect, held: bool = False) -> Problem:
-    """The problem with the coordinate of a suspect, which is free unless `held`; that of an
-    alternative that holds or does not is held always. Raises `ValueError` where it cannot be."""
+def problem_with(problem: Problem, *some: Suspect, held: bool = False) -> Problem:
+    """The problem with the coordinates of some suspects, which are free unless `held`; that of an
+    alternative that holds or does not is held always. Raises `ValueError` where one cannot be."""
     unknowns, sensors, fixed = dict(problem.unknowns), dict(problem.sensors), set(problem.held)
     alternatives = [*problem.alternatives.values()]
-    if held or not one.has_amount:
-        fixed.add(one.label)
-    if one.extension or (one.parameter and held and one.nominal > 0):
-        unknowns[one.parameter] = Unknown()
-    elif one.parameter:
-        reach = AMOUNTS * one.step / one.nominal
-        low, high = sorted(
-            farthest(problem.recordings, one.parameter, one.nominal, part)
-            for part in (-reach, reach)
-        )
-        scale = "log" if low > 0 else "linear"
-        unknowns[one.parameter] = Unknown(nominal=one.nominal, low=low, high=high, scale=scale)
-    elif one.fault is not None:
-        channel, kind = one.fault
-        longest = max(1.0, *(recording.duration for recording in problem.recordings))
-        most = FAULTS[kind].most * FAULTS[kind].scale(sensors[channel], longest)
-        sensors[channel] = sensors[channel].model_copy(update={kind: most})
-    else:
-        alternatives.append(one)
+    longest = max(1.0, *(recording.duration for recording in problem.recordings))
+    for one in some:
+        if held or not one.has_amount:
+            fixed.add(one.label)
+        if one.extension or (one.parameter and held and one.nominal > 0):
+            unknowns[one.parameter] = Unknown()
+        elif one.parameter:
+            unknowns[one.parameter] = unknown_near(problem.recordings, one)
+        elif one.fault is not None:
+            channel, kind = one.fault
+            most = FAULTS[kind].most * FAULTS[kind].scale(sensors[channel], longest)
+            sensors[channel] = sensors[channel].model_copy(update={kind: most})
+        else:
+            alternatives.append(one)
     return Problem(problem.recordings, sensors, unknowns, problem.noise, alternatives, fixed)
+
+
+def unknown_near(recordings: Sequence[Recording], one: Suspect) -> Unknown:
+    """The parameter of a suspect as an unknown, from its stated value. Raises `ValueError`."""
+    reach = AMOUNTS * one.step / one.nominal
+    low, high = sorted(
+        farthest(recordings, one.parameter, one.nominal, part) for part in (-reach, reach)
+    )
+    scale = "log" if low > 0 else "linear"
+    return Unknown(nominal=one.nominal, low=low, high=high, scale=scale)
 
 
 def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
@@ -148,13 +153,14 @@ Column = tuple[Suspect, Array | None, str]
 def exact_columns(end: Fit, some: Sequence[Suspect]) -> tuple[list[Column], Array | None]:
     """Columns of suspects that are coordinates, and the Jacobian (m, n) of the fitted coordinates,
     from one run of each recording."""
-    out, wide, mine = list[Column](), end.problem, list[Suspect]()
-    for one in (one for one in some if one.change is None):
-        try:
-            wide = problem_with(wide, one, held=True)
-            mine.append(one)
-        except ValueError as error:
-            out.append((one, None, str(error)))
+    mine, out = [one for one in some if one.change is None], list[Column]()
+    try:
+        wide = problem_with(end.problem, *mine, held=True)
+    except ValueError:  # which suspects cannot be
+        reasons = {one.name: impossible(end.problem, one) for one in mine}
+        out += [(one, None, reasons[one.name]) for one in mine if reasons[one.name]]
+        mine = [one for one in mine if not reasons[one.name]]
+        wide = problem_with(end.problem, *mine, held=True)
     c = wide.coordinates
     names = np.isin(c.labels, [*end.labels, *(one.label for one in mine)])
     x = c.with_known(end.by_label)
@@ -165,6 +171,15 @@ def exact_columns(end: Fit, some: Sequence[Suspect]) -> tuple[list[Column], Arra
         i = c.labels.index(one.label)
         out.append((one, at.J[:, i] * (one.step / c.all[i].slope(x[i])), ""))
     return out, at.J[:, [c.labels.index(label) for label in end.labels]]
+
+
+def impossible(problem: Problem, one: Suspect) -> str:
+    """Why a suspect cannot be a coordinate; empty if it can."""
+    try:
+        problem_with(problem, one, held=True)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 def difference_column(end: Fit, one: Suspect) -> Column:
