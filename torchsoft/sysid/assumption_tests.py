@@ -176,7 +176,7 @@ class Linearised:
 
     def refit_test(self, one: Suspect, fit: Fit, score: AssumptionTest) -> AssumptionTest:
         """Test of a suspect by a refit; without estimates where that has not converged."""
-        r = fit.at.r if fit.check.bias is None else fit.check.finer.r
+        r = fit.tested
         left, gain = float(r @ r), self.square - float(r @ r)
         rest = max(1.0, left / self.dof)
         favoured, sd = one.amount, (rest / max(abs(gain), 1e-300)) ** 0.5 * one.amount
@@ -224,7 +224,7 @@ class Linearised:
         them. `fit` is its refit, if there is one."""
         out = list[AssumptionTest]()
         if fit is not None:
-            r, J = fit.at.r, fit.J
+            r, J = fit.tested, fit.J
         else:
             J = np.column_stack((self.J, columns[best.name][1]))
             r = self.r - J @ shift(J, self.r)

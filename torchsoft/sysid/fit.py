@@ -358,6 +358,11 @@ class Fit(NamedTuple):
         return standard_deviations(self.J)
 
     @property
+    def tested(self) -> Array:
+        """Residuals (m,) by which the fit is tested: those of the check of its steps, if any."""
+        return self.at.r if self.check.bias is None else self.check.finer.r
+
+    @property
     def square(self) -> float:
         """Sum of squared residuals."""
         return float(self.at.r @ self.at.r)
