@@ -19,7 +19,7 @@ test-slow: $(STAMP)
 # the newest Python that has wheels of everything; a plain install of torch brings some GB of CUDA
 NEWEST ?= python3.13
 test-newest:
-	$(NEWEST) tests/newest.py $(NEWEST)
+	bash tests/newest.sh $(NEWEST)
 
 test-hostile: $(STAMP)
 	$(BIN)/python -m pytest -m slow --dist worksteal tests/hostile --timeout 1800
