@@ -4,7 +4,6 @@ assumptions are equal; each of its deviations does what its name says."""
 import ast
 import re
 from functools import cache
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,7 @@ from conftest import PAPER, excited
 
 from experiments.validation import foreign
 from experiments.validation.foreign import Numbers, Run
-from experiments.validation.foreign.motion import lying, pads
 from experiments.validation.foreign.pad import compliance
-from experiments.validation.foreign.step import CREEP, SAMPLED_AT, TAKEN_IN, aged, friction, node
 from torchsoft import BuiltRig, PadMesh, Trajectory, simulate
 from torchsoft.physics.mesh import unit_compliance
 from torchsoft.rigs.excite import Excitation
@@ -113,26 +110,6 @@ def test_it_shares_nothing_with_torchsoft_and_its_pads_are_as_soft():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slipping", [False, True])
-def test_the_literal_law(slipping):
-    """A spring and a dashpot from the place of first contact; once the force in them has been above
-    mu_s F_N, mu_k F_N against the sliding, and the spring goes on stretching."""
-    p, h, depth = OWN._replace(literal=True), STEP, 5e-5
-    for v, s in product((0.02, -0.02), (1e-6, 1e-3)):
-        fx, fy, torque, stretch, slips, _ = node(
-            p, h, 0.0, 0.0, 0.0, v / (p.radius - depth), 0.0, -(p.radius - depth), s, slipping,
-            p.mu_s, p.mu_k,
-        )  # fmt: skip
-        F_N, e = p.K_n * depth, p.K_t * stretch + p.R_t * v
-        assert -fy == pytest.approx(F_N)
-        assert stretch == pytest.approx(s + h * v)
-        assert slips == (abs(e) > p.mu_s * F_N)
-        e = p.mu_k * F_N * v / np.hypot(v, CREEP) if slipping else e
-        assert fx == pytest.approx(e * depth / (depth + TAKEN_IN))
-        assert torque == pytest.approx(-(p.radius - depth) * fx)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("differs", "matters"),
     [
@@ -150,113 +127,3 @@ def test_a_deviation_exceeds_the_sensors_or_changes_no_bit(differs, matters):
     own, other = (independent(2 * STEP, p).channels for p in (OWN, OWN._replace(**differs)))
     off = {c: np.abs(own[c] - other[c]).max() for c in CHANNELS}
     assert max(off["F_x"] / 0.1, off["x_C"] / 1e-5) > 1 if matters else not any(off.values())
-
-
-REST = OWN._replace(senses_disc=True, through=2, length=0.03, x_C0=0.015, across=120)
-"""The disc lies on the lower pad, of a fine mesh, while the bracket hangs far above it."""
-PULL = 5.0
-"""Force [N] that is fed forward to the bracket after a tenth of the time."""
-
-
-def hanging(p: Numbers, duration: float, step: float = 1e-4, pull: float = 0.0) -> Run:
-    """A run of the disc alone, every step a row; the bracket's set-points are at rest."""
-    t = step * np.arange(round(duration / step) + 1)
-    signals = np.zeros((len(t), 3, 2))
-    signals[:, 0, 0], signals[:, 1, 0] = p.x_C0, 0.1
-    signals[len(t) // 10 :, 2, 0] = pull
-    return foreign.simulate(p, t, signals)
-
-
-def late(back: float):
-    return lambda f: np.interp(np.arange(len(f)) - back, np.arange(len(f)), f)
-
-
-def lagging(f: np.ndarray) -> np.ndarray:
-    """Backward Euler's steps of a fifth of the lag."""
-    out = f.copy()
-    for i in range(1, len(f)):
-        out[i] = (out[i - 1] + 0.2 * f[i]) / 1.2
-    return out
-
-
-def held(f: np.ndarray) -> np.ndarray:
-    """Samples every ten steps, taken after a part of the period."""
-    first = round(10 * SAMPLED_AT)
-    return f[np.maximum(first + 10 * ((np.arange(len(f)) - first - 1) // 10), 0)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("deviation", "of"),
-    [
-        ({"delay": 5e-4}, late(5)),
-        ({"delay": 2.5e-4}, late(2.5)),
-        ({"delay": 0.4e-4}, late(0.4)),
-        ({"lag": 5e-4}, lagging),
-        ({"hold": 1e-3}, held),
-        ({"F_x_most": 1.0, "F_y_most": 1.0}, lambda f: np.clip(f, -1.0, 1.0)),
-    ],
-)
-def test_a_controller_that_deviates(deviation, of):
-    p = REST._replace(**deviation)
-    c = hanging(p, 0.03, pull=PULL).channels
-    ahead = np.where(np.arange(301) >= 30, PULL, 0.0)
-    asked = {
-        "F_x": p.K_x * (p.x_C0 - c["x_C"]) - p.R_x * c["v_x"],
-        "F_y": p.K_y * (0.1 - c["y_Br"]) - p.R_y * c["v_y_Br"] + ahead,
-    }
-    for name, force in asked.items():
-        np.testing.assert_allclose(c[name][10:], of(force)[10:], atol=2e-6)
-    assert np.ptp(c["F_y"]) > 1.0
-
-
-@pytest.mark.slow
-def test_friction_of_the_upper_contact_wear_and_age():
-    """Age grows at rest, and goes with slip until the time of a slip of `renewed` is left."""
-    p = OWN._replace(upper_friction=1.03, ageing=0.02, ageing_time=0.01)
-    assert friction(p, 0, 0.0, 1.0) == pytest.approx((p.mu_s, p.mu_k))
-    assert friction(p, 1, 0.0, 0.9) == pytest.approx((0.927 * p.mu_s, 0.927 * p.mu_k))
-    assert friction(p, 0, 0.1, 1.0) == pytest.approx((p.mu_s + 0.02 * np.log(11.0), p.mu_k))
-    age = 0.0
-    for speed, expected in ((0.0, 1e-2), (0.1, p.renewed / 0.1)):
-        for _ in range(100):
-            age = aged(p, 1e-4, age, speed)
-        assert age == pytest.approx(expected)
-
-
-@pytest.mark.slow
-def test_a_weight_off_the_centre_rocks():
-    """On a hard pad the disc rocks about the place where its weight is lowest, at the rate of a
-    pendulum that rolls."""
-    c = 2e-3
-    p = REST._replace(com_x=0.05 * c, com_y=-c, E=50e6, tau=1e-4, R_n=30.0, R_t=30.0)
-    run = hanging(p, 1.3, 2e-4)
-    inertia = p.mass * (0.5 * p.radius**2 + (p.radius - c) ** 2)
-    crossings = run.t[1:][np.diff(np.sign(run.channels["theta"] + 0.05)) != 0]
-    assert len(crossings) > 2
-    rate = np.pi / np.diff(crossings).mean()
-    assert rate == pytest.approx((p.mass * p.gravity * c / inertia) ** 0.5, rel=0.03)
-
-
-@pytest.mark.slow
-def test_a_tilted_pad_is_a_turned_gravity():
-    """To first order the disc rolls down a pad as it does along a level one in a gravity turned
-    the other way, by half of a fall along the slope over 1.5 masses, less by the mesh."""
-    down, along = (
-        hanging(REST._replace(**one), 0.1).channels["x_C"][-1] - REST.x_C0
-        for one in ({"tilt_L": -1e-3}, {"tilt": 1e-3})
-    )
-    assert down == pytest.approx(along, rel=0.05)
-    assert 0.8 < along / (0.5 * 9.81e-3 / 1.5 * 0.1**2) < 1.0
-
-
-@pytest.mark.slow
-def test_pads_that_soften():
-    """By the end of a slow run the disc, without friction, lies as deep as on pads of what is left
-    of E; retardation of 10 ms of 2 s leaves it half a percent behind."""
-    p = REST._replace(softening=0.2, mu_s=0.0, mu_k=0.0)
-    X, C, share = pads(p)
-    y = hanging(p, 2.0, 1e-3).channels["y_C"]
-    start, end = (lying(p, scale * C[0], X, share)[0] for scale in (1.0, 1 / 0.8))
-    assert y[0] == start
-    assert y[-1] - start == pytest.approx(0.995 * (end - start), rel=5e-3)
