@@ -5,7 +5,6 @@ from copy import deepcopy
 from dataclasses import replace
 
 import pytest
-import torch
 from conftest import COARSE, paper, rest, still, times
 
 from torchsoft import simulate
@@ -50,6 +49,16 @@ def test_parts_that_are_shared_are_extended_once():
         extend(model, ["contact.colour"])
 
 
+@pytest.mark.parametrize(("name", "late"), [("actuators.lag", "xy"), ("actuators.y.lag", "y")])
+def test_loops_lag_together_or_alone(name, late):
+    """Behind laws whose numbers keep their names."""
+    model = deepcopy(MODEL)
+    extend(model, [name])
+    lag = model.parameter(name)
+    assert {k for k, one in model.actuators.items() if getattr(one.law, "lag", 0) is lag} == {*late}
+    assert model.parameter("actuators.y.Kp") is model.actuators["y"].law.law.Kp
+
+
 def test_names_are_those_of_a_rig_file():
     rig = RigFile.ready("two_fingers").assemble()
     names = [name for name in extensions(rig) if name.endswith(".power")]
@@ -78,20 +87,11 @@ def test_an_extension_may_be_unknown():
 
 
 def test_the_friction_of_a_contact_differs_from_its_law():
-    """Both contacts keep the numbers of the law, and 1.2 of its friction is 1.2 times mu_s and
-    mu_k."""
-    model, other = deepcopy(MODEL), deepcopy(MODEL)
+    """Both contacts keep the numbers of the law; `test_friction` has the forces."""
+    model = deepcopy(MODEL)
     extend(model, ["contacts.U.friction_ratio", POWER])
     law, mine = model.contacts["L"].law, model.contacts["U"].law
-    assert law.K_n is mine.K_n
-    assert law.power is mine.power
-    assert law.friction is mine.friction
-    with torch.no_grad():
-        model.parameter("contacts.U.friction_ratio").fill_(1.2)
-        for name in ("mu_s", "mu_k"):
-            other.parameter(f"laws.steel_on_rubber.friction.{name}").mul_(1.2)
-    g, g_dot, v, s = torch.tensor([1e-4, 0.0, 0.3, 2e-5], dtype=torch.float64)
-    assert mine(g, g_dot, v, s).F_T.item() == pytest.approx(
-        other.contacts["U"].law(g, g_dot, v, s).F_T.item(), rel=1e-12
-    )
-    assert law(g, g_dot, v, s).F_T.item() < 0.9 * mine(g, g_dot, v, s).F_T.item()
+    for name in ("K_n", "power", "friction"):
+        assert getattr(law, name) is getattr(mine, name)
+    assert mine.friction_ratio is model.parameter("contacts.U.friction_ratio")
+    assert law.friction_ratio is None
