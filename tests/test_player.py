@@ -1,5 +1,6 @@
 """The interactive player, in a real browser where there is one."""
 
+import base64
 import copy
 import json
 import re
@@ -17,7 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from torchsoft import Trajectory
-from torchsoft.plot.animation import charts, frame_rows, packed, player
+from torchsoft.plot.animation import charts, frame_rows, player
 from torchsoft.plot.scene import Scene, curve_height, instants
 
 SEEN = "return [...document.querySelectorAll('.chart span')].map(x => x.textContent)"
@@ -63,6 +64,15 @@ def test_the_file_holds_everything(run, tmp_path):
     assert data["title"] == title
     assert len(data["times"]) <= 20
     assert {"disc", "bracket"} == {*data["bodies"]}
+
+
+def test_the_file_holds_the_pressure_in_every_element(run, tmp_path):
+    player(run, tmp_path / "run.html", frames=10)
+    shown, pad = held(tmp_path / "run.html")["pads"]["L"]["fields"]["pressure"], run.setup.pads["L"]
+    codes = np.frombuffer(base64.b64decode(shown["codes"]), "<u2").reshape(shown["shape"])
+    stress = pad.stress(pad.displacement(run.displacement["L"][frame_rows(run, 10)].numpy()))
+    expected = -1e-3 * stress[..., :3].mean(-1)
+    np.testing.assert_allclose(shown["low"] + shown["step"] * codes, expected, atol=shown["step"])
 
 
 def with_forces(run: Trajectory, force: dict[str, torch.Tensor]) -> Trajectory:
@@ -168,14 +178,6 @@ def test_charts_follow_the_slider(page, run):
         assert shown["set-point"] == pytest.approx(1e3 * float(run["y_d"][row]), rel=1e-3)
 
 
-@pytest.mark.parametrize("values", [[0.5, 0.5], [3e-12, 100.0, -2.0], [0.0, 5e-11]])
-def test_what_a_file_does_not_resolve_is_nothing(page, values):
-    step = np.ptp(values) / 65535
-    unpacked = page.run("return [...unpack(arguments[0])]", packed(np.array(values)))
-    assert unpacked == pytest.approx([x if abs(x) > step else 0.0 for x in values], abs=step)
-    assert (0.0 in unpacked) == (min(map(abs, values)) < step)
-
-
 def test_forces_of_nothing_are_none(run):
     still = with_forces(run, {k: x * torch.tensor([1.0, 1e-13]) for k, x in run.force.items()})
     series = {one["name"]: one["series"] for one in charts(still, [*range(51)])}
@@ -195,28 +197,6 @@ def test_a_point_tells_its_forces(page, run):
     assert float(said["normal force"]) == pytest.approx(normal, rel=1e-3)
     assert abs(float(said["friction"])) == pytest.approx(abs(friction), abs=1e-3 * normal)
     assert float(said["cone"]) == pytest.approx(0.8 * normal, rel=1e-3)
-
-
-def test_an_element_tells_its_stress(page, run):
-    page.run(SLIDE, 29)
-    middle = """const p = data.pads.L, c = [0, 0], e = arguments[0];
-    for (let k = 0; k < 4; k++) { const o = 2 * (frame * p.count + p.elements[4 * e + k]);
-      c[0] += p.nodes[o] / 4; c[1] += p.nodes[o + 1] / 4; }
-    const r = document.getElementById('scene').getBoundingClientRect();
-    for (let i = 0; i < 6; i++) { const q = toScreen(c, r.width, r.height); view.x = c[0]; view.y = c[1]; view.k = 40; }
-    drawScene(); return [r.x + r.width / 2, r.y + r.height / 2]"""  # noqa: E501
-    pad = run.setup.pads["L"]
-    stress = pad.stress(pad.displacement(run.displacement["L"][-1].numpy()))
-    centres = pad.mesh.nodes[pad.mesh.elements].mean(1)
-    low = np.where(centres[:, 1] < pad.mesh.nodes[:, 1].max() / 2)[0]  # away from contact points
-    element = int(low[np.abs(stress[low, 1]).argmax()])
-    x, y = page.run(middle, element)
-    page.act({"type": "pointerMove", "x": round(x), "y": round(y), "origin": "viewport"})
-    tip = page.run("return document.getElementById('tip').textContent")
-    assert f"pad L, element {element}" in tip
-    pressure = float(re.search(r"pressure\s+([-\d.e]+) kPa", tip)[1])
-    assert pressure == pytest.approx(-1e-3 * stress[element, :3].mean(), rel=1e-3, abs=0.01)
-    page.run("document.getElementById('fit').click()")
 
 
 def test_it_plays_zooms_and_switches(page, tmp_path):
@@ -241,11 +221,6 @@ def test_it_plays_zooms_and_switches(page, tmp_path):
         assert np.abs(pictures[one] - pictures[other]).max() > 50
     page.run(SLIDE, 0)
     page.run("document.getElementById('speed').value = '0.5'; toggle()")
-    frame = 0
-    for _ in range(40):
-        frame = page.run("return frame")
-        if frame > 3:
-            break
-    assert frame > 3
+    assert any(page.run("return frame") > 3 for _ in range(40))
     page.run("stop()")
     assert [one for one in page.log("browser") if one["level"] == "SEVERE"] == []

@@ -70,7 +70,7 @@ def test_a_run_is_loaded_as_it_was(done, tmp_path, inertial):
 
 
 def without(name: str) -> Any:
-    def change(data: xr.Dataset) -> xr.Dataset:
+    def change(data):
         data.attrs.pop(name, None)
         return data.drop_vars(name, errors="ignore")
 
@@ -129,10 +129,9 @@ def test_vtk_files_are_read_back(tmp_path):
         np.testing.assert_allclose(written, moved, atol=1e-15)
         nodes = pad.placed(pad.mesh.nodes) @ turn.T + [x, y]
         np.testing.assert_allclose(mesh.points[where, :2], nodes, atol=1e-15)
-        stress = pad.stress(own)
-        np.testing.assert_allclose(mesh.cell_data["von_mises"][0][rows], von_mises(stress))
-        tensor = mesh.cell_data["stress"][0][rows].reshape(-1, 3, 3)
+        tensor, stress = mesh.cell_data["stress"][0][rows].reshape(-1, 3, 3), pad.stress(own)
         np.testing.assert_allclose(np.trace(tensor, axis1=1, axis2=2), stress[:, :3].sum(1))
+        np.testing.assert_allclose(mesh.cell_data["von_mises"][0][rows], von_mises(stress))
         first += count
     with pytest.raises(ValueError, match=r"must end in \.pvd"):
         run.to_vtk(tmp_path / "run.vtk")
@@ -168,7 +167,7 @@ def test_channels_have_one_name_and_unit_everywhere(done, tmp_path):
 
 
 def test_objects_show_themselves(done, tmp_path):
-    """As text and as pages; figures as pictures, films as videos or players."""
+    """As text and as pages; figures as pictures, films as players."""
     model, run = done
     batch = simulate_batch(model, T[:3], y0=[run.y[0], run.y[-1]])
     for one, words in (
@@ -179,16 +178,11 @@ def test_objects_show_themselves(done, tmp_path):
         text, page = repr(one), one._repr_html_()
         assert len(text.splitlines()) <= 20
         assert all(word in text and word in page for word in words)
-    figure = run.plot()
-    assert "_EmbeddedFonts" not in repr(figure)
-    assert figure._repr_png_().startswith(b"\x89PNG")
-    gif = run.animate(tmp_path / "run.gif", frames=2, dpi=30)
-    assert gif._repr_html_().startswith('<img src="data:image/gif;base64,R0lG')
-    player = run.animate(str(tmp_path / "run.html"), frames=2)
+    assert run.plot()._repr_png_().startswith(b"\x89PNG")
+    player = run.animate(tmp_path / "run.html", frames=2)
     page = re.fullmatch(r'<iframe srcdoc="([^"]*)" .*></iframe>', player._repr_html_())
     assert page
     assert unescape(page[1]) == (tmp_path / "run.html").read_text(encoding="utf-8")
-    assert str(tmp_path / "run.html") in str(player)
 
 
 def test_points_stick_slip_and_part_as_the_graph_says():
@@ -228,17 +222,6 @@ def test_a_progress_bar_is_shown_to_people_only(capfd):
 # ----------------------------------------------------------------------
 
 
-def test_a_start_is_stated_by_coordinates():
-    model, place = coarse(), {"x": 0.06, "y": 0.0241}
-    disc = place | {"v_x": 0.01, "omega": -0.5}
-    start = model.state({"disc": disc, "bracket": {"x": 0.06, "y": 0.06}})
-    state = model.unpack(start)
-    assert state.velocity["disc"].tolist() == [0.01, 0.0, -0.5]
-    assert state.pose["disc"].tolist() == [*place.values(), 0.0]
-    assert not bool(state.pads["U"].any())
-    assert simulate(model, T[:3], y0=start.detach())["v_x"][0] == 0.01
-
-
 # the package
 # ----------------------------------------------------------------------
 
@@ -246,7 +229,7 @@ def test_a_start_is_stated_by_coordinates():
 def test_a_star_imports_what_is_public():
     import pydoc
 
-    names: dict[str, Any] = {}
+    names = {}
     exec("from torchsoft import *", names)
     assert {"RigFile", "simulate", "Rig", "Trajectory"} <= names.keys()
     assert "torch" not in names
