@@ -110,7 +110,7 @@ CODINGS = (
     ("latin-1", "# \xb5\n"),
 )  # fmt: skip
 
-BYTES: Damages = {
+BYTES = {
     "a bit": lambda v: flipped(v.content, v.rng),
     "a bit of the beginning": lambda v: flipped(v.content[:32], v.rng) + v.content[32:],
     "ones": lambda v: b"\x01" * 64 + v.content[64:],
@@ -120,19 +120,19 @@ BYTES: Damages = {
     "longer": lambda v: v.content + v.rng.bytes(int(v.rng.integers(1, 5000))),
     "text": lambda v: b"t [s], x_C [mm]\n0, 1\n",
 }
-TEXT: Damages = BYTES | {"inserted": inserted, "another encoding": encoded}
-PLANTED: Damages = {
+TEXT = BYTES | {"inserted": inserted, "another encoding": encoded}
+PLANTED = {
     "a pickle": lambda v: pickle.dumps(v.trap),
     "a sealed pickle within an archive": lambda v: v.seal(objects(v.trap)),
     "a sealed beginning of HDF5": lambda v: v.seal(b"\x89HDF\r\n\x1a\n"),
     "a sealed archive of others": lambda v: v.seal(archive(kind=np.asarray("Trap"), x=np.zeros(2))),
 }
-FOREIGN: Damages = {
+FOREIGN = {
     "another's": lambda v: v.other.read_bytes(),
     "exchanged": exchanged,
 }
-GONE: Damages = {"gone": replaced(bool), "a folder": replaced(Path.mkdir)}
-SPECIAL: Damages = {
+GONE = {"gone": replaced(bool), "a folder": replaced(Path.mkdir)}
+SPECIAL = {
     "a pipe": replaced(os.mkfifo),
     "a link to itself": replaced(lambda path: path.symlink_to(path)),
 }

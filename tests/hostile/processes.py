@@ -93,7 +93,7 @@ def performed(
 ) -> tuple[int, list[str]]:
     """Exit status of a process that does the function and dies before (or halfway in) operation
     `last` on files below `folder`; without `last`, also every operation in order."""
-    done: list[str] = []
+    done = []
     report = folder.with_suffix(".operations")
 
     def tick(operation: str, path: Any) -> bool:

@@ -56,10 +56,12 @@ def roll(_=0):
     coarse = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
     force = {"motion.F_ff.values": [0.0, -75.0]}
     built = RigFile.ready("paper").override(coarse | force).build()
-    run = built.run(torch.linspace(0, 0.3, 7, dtype=torch.float64))
-    return [float(value).hex() for value in run["y_Br"]]
+    run = built.run(torch.linspace(0, 0.3, 7, dtype=torch.float64), gradient="discrete")
+    run["y_Br"][-1].backward()
+    slope = built.rig.parameter("materials.rubber.E").grad
+    return [float(value).hex() for value in (*run["y_Br"].detach(), slope)]
 """
-"""A program that can roll the disc, to the bit."""
+"""A program that can roll the disc, and differentiate that, to the bit."""
 
 ROLL = ROLLING + "print(json.dumps(roll()))\n"
 

@@ -96,7 +96,7 @@ def design_briefly(config: Config) -> None:
         finite(y0, simulate(rig, BRIEFLY, y0=y0, step=2e-3).y)
 
 
-KINDS: dict[str, tuple[Any, Callable[[], list[dict[str, Any]]], int, Callable[[Any], None]]] = {
+KINDS = {
     "rig files": (RigFile, rigs, 8000, run_briefly),
     "dataset configurations": (Config, datasets, 4000, design_briefly),
 }

@@ -1,19 +1,15 @@
-"""Random models, and models in many threads: a run is finite and its energies balance or it warns
-that they do not, or it fails in one sentence, in time; and threads give the bits of runs alone."""
+"""Random models: a run is finite and its energies balance or it warns that they do not, or it fails
+in one sentence, in time."""
 
 import copy
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial, reduce
 from operator import getitem
-from threading import Barrier
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, grasped, still, times, towards
 from torch import Tensor
 
 from hostile.damage import leaves
@@ -23,7 +19,6 @@ from torchsoft import (
     BuiltRig,
     Ellipse,
     NoEquilibrium,
-    Profile,
     RigFile,
     RoundedBox,
     SimulationFailed,
@@ -67,7 +62,7 @@ def build(rng: np.random.Generator) -> BuiltRig:
             "points": some(0, 1, 2), "inertial": some(False, False, True),
             "bonded_sides": some(False, False, True),
         }  # fmt: skip
-    parts: dict[str, Any] = {}
+    parts = {}
     for name, contact_law in tree["laws"].items():
         friction = contact_law["friction"]
         friction["mu_k"] = friction["mu_s"] * rng.uniform(0.3, 1.0)
@@ -118,43 +113,3 @@ def test_random_models_run_or_say_why_not(tally):
         run = partial(run_randomly, random("models", number))
         ran += bool(tally.call(f"model {number}", run, REJECTIONS, limit=30.0))
     assert ran >= 0.3 * tally.tried, f"only {ran} of {tally.tried} models ran"
-
-
-T, THREADS = times(6e-3, 4), 8
-
-
-@pytest.mark.filterwarnings("ignore:the energies of the run", "ignore:the slip law of")
-@pytest.mark.parametrize(("number", "runs"), [(50, 2), (10, 50)], ids=["new laws", "runs"])
-def test_threads_give_the_bits_of_runs_alone(number, runs, tally):
-    """Eight threads that start at once, of which two share a model, round after round; with laws
-    that all meet for the first time."""
-    mesh = {"pad.elements_x": 24}
-    for round in range(count(number)):
-        models = [
-            still(COARSE | mesh | own, **part)
-            for own, part in (
-                ({}, {}), ({"pad.inertial": True}, {}), ({"contact.points": 2}, {}),
-                ({}, {"friction": law(round)}),
-            )
-        ]  # fmt: skip
-        starts, barrier = [grasped(model, (0.05, 0.0)) for model in models], Barrier(THREADS)
-
-        def run(thread: int, i: int, models: Any = models, starts: Any = starts) -> list[Tensor]:
-            """States, forces and derivatives."""
-            model, y0 = models[thread % 4], starts[thread % 4]
-            x_d = Profile([0.0, 6e-3], [0.06, 0.06 + 2e-5 * ((thread + i) % 5)])
-            how: dict[str, Any] = {"gradient": "discrete", "reference": towards(model, x_d)}
-            run = simulate(model, T, y0=y0, **how)
-            wanted = [p for p in model.parameters() if p.requires_grad]
-            slopes = grad(run["theta"][-1] + 1e2 * run["x_C"][-1], wanted)
-            return [run.y.detach(), run.force["L"].detach(), *slopes]
-
-        def work(thread: int, barrier: Barrier = barrier, run: Any = run) -> list[list[Tensor]]:
-            barrier.wait()
-            return [run(thread, i) for i in range(runs)]
-
-        with ThreadPoolExecutor(THREADS) as pool:
-            results = [*pool.map(work, range(THREADS))]
-        for thread, found in enumerate(results):
-            same = [all(map(torch.equal, one, run(thread, i))) for i, one in enumerate(found)]
-            tally.held(all(same), f"round {round}, thread {thread}: other bits in {same}")

@@ -9,7 +9,6 @@ What is asked for after changes, a gradient too, has the bits of what was asked 
 import copy
 import pickle
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -217,9 +216,7 @@ class Changes:
 
 
 HELPERS = "some", "near", "parameter", "compare"
-OPERATIONS: list[Callable[[Changes], None]] = [
-    one for name, one in vars(Changes).items() if name[0] != "_" and name not in HELPERS
-]
+OPERATIONS = [one for name, one in vars(Changes).items() if name[0] != "_" and name not in HELPERS]
 
 
 @pytest.mark.parametrize("operation", OPERATIONS, ids=lambda one: one.__name__)

@@ -1,16 +1,14 @@
-"""Users without rights, first runs in many threads, and commands in any locale."""
+"""Users without rights, and first runs in many threads."""
 
-import json
 import os
 import re
 import shutil
 from typing import Any
 
 import pytest
-from conftest import IDENTIFIED
 
 from hostile.processes import ROOT, start
-from hostile.specimens import ROLL, ROLLING, cells, csv_text
+from hostile.specimens import ROLL, ROLLING
 from hostile.trial import Tally, count
 from torchsoft.solve.kernel import objects
 
@@ -45,7 +43,7 @@ def rolled():
     return re.escape(out)
 
 
-NOWHERE: list[dict[str, Any]] = [
+NOWHERE = [
     {"HOME": "/nonexistent"}, {"HOME": None, "MPLCONFIGDIR": None, "TMPDIR": "/nonexistent"},
     {"HOME": "/", "XDG_CACHE_HOME": "/proc/nothing"}, {"TORCHSOFT_CACHE_DIR": "/nonexistent"},
 ]  # fmt: skip
@@ -59,7 +57,7 @@ def test_users_without_rights(tally, rolled, tmp_path):
         pytest.skip("another user cannot run this Python")
     ignored = shutil.ignore_patterns("__pycache__", "objects")
     shutil.copytree(ROOT / "torchsoft", tmp_path / "torchsoft", ignore=ignored)
-    user: dict[str, Any] = {"user": USER, "package": tmp_path}
+    user = {"user": USER, "package": tmp_path}
     told = "(.*\n)?torchsoft: note: compiled kernels cannot be kept in [^\n]*\n"
     for where in NOWHERE:
         expect(tally, "-c", KEEP, out="None\n", err=told, **user, **where)
@@ -82,33 +80,3 @@ with ThreadPoolExecutor(8) as pool:
 """
     for _ in range(count(3)):
         expect(tally, "-c", program, out=f"({rolled}){{8}}")
-
-
-# commands
-# ----------------------------------------------------------------------
-
-LOCALES: tuple[dict[str, str], ...] = (
-    {}, {"LC_ALL": "C"}, {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-)  # fmt: skip
-"""The last knows ASCII only."""
-
-
-@pytest.mark.parametrize("locale", LOCALES)
-def test_commands_say_why_in_any_locale(tmp_path, locale, tally):
-    """Nothing is started, the status is 2, and the last line says why; names are kept in files."""
-    data, config = tmp_path / "größe µ.csv", tmp_path / "αβ.toml"
-    data.write_text(csv_text(cells()), encoding="utf-8")
-    files = str(data), str(config), "--out", str(tmp_path / "ö")
-    command = "-m", "torchsoft", "identify", *files, "--no-progress"
-    for wrong, word in (
-        (b"title = '\xff'\n", "not a TOML file"), (b"a = " + b"[" * 20_000, "nested too deeply"),
-        ((IDENTIFIED + "[unknowns.'pad.µ']\n").encode(), "pad"),
-        ((IDENTIFIED + "starts = 1000000\n").encode(), "--yes"),
-    ):  # fmt: skip
-        config.write_bytes(wrong)
-        told = f"(.*\n)?[^\n]*{word}[^\n]*\n"
-        expect(tally, *command, status=2, out=".*", err=told, **locale)
-    config.write_text("# Reibung µ, Größe θ\n" + IDENTIFIED, encoding="utf-8")
-    expect(tally, *command, err=".*", **locale)
-    written = json.loads((tmp_path / "ö" / "answer.json").read_text(encoding="utf-8"))
-    tally.held("größe µ" in str(written), "the name is lost")
