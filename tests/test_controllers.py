@@ -1,5 +1,6 @@
 """Control laws that see the whole state and give several efforts."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -75,11 +76,7 @@ def test_a_network_of_the_state_in_a_file(tmp_path):
     asked._folder = tmp_path
     (found, *_) = check(asked)
     assert (found.severity, found.where) == ("error", "controllers.jaw.network")
-    assert "has the shape (3, 8)" in found.message
-    assert (
-        "from 10 inputs (x_d, y_d, x_d', y_d', bracket.x, bracket.y, disc.x, bracket.x', "
-        "bracket.y', disc.x')" in found.message
-    )
+    assert re.search(r"has the shape \(3, 8\).* from 10 inputs \(x_d, y_d, x_d', ", found.message)
 
 
 @pytest.mark.parametrize(

@@ -151,9 +151,7 @@ def test_hidden_worksheets_are_not_read(state, tmp_path):
     book["old"].sheet_state = state
     book.create_chartsheet("chart")
     book.save(path)
-    values = read(path).values
-    assert values.keys() == {"t", "x"}
-    assert values["x"] == pytest.approx([1e-3, 2e-3])
+    assert read(path).values.keys() == {"t", "x"}
     book.remove(book["shown"])
     book.active = 1
     book.save(path)

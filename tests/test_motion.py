@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from torch.autograd import gradcheck
 
 from torchsoft import Profile, Reference, Sampled, hold
-from torchsoft.physics.motion import Lines, Piecewise, Retimed, Waves, wave
+from torchsoft.physics.motion import Lines, Retimed, Waves, wave
 
 TIMES, VALUES = np.array([0.0, 0.4, 1.0, 1.5]), np.array([0.06, 0.04, 0.05, 0.01])
 RATES = np.array([0.1, -0.2, 0.0, 0.3])
@@ -47,7 +47,7 @@ def clip(f: Callable[..., NDArray[np.float64]]) -> Callable[..., NDArray[np.floa
 
 REST = CubicSpline(TIMES, VALUES, bc_type="clamped")
 # A new motion is one line: how it is made, and its values.
-MOTIONS: dict[str, tuple[Callable[[], Piecewise], Callable[..., NDArray[np.float64]]]] = {
+MOTIONS = {
     "profile": (lambda: Profile(TIMES, VALUES), seventh),
     "lines": (lambda: Lines(TIMES, VALUES), lambda t: np.interp(t, TIMES, VALUES)),
     "sampled": (lambda: Sampled(TIMES, VALUES), clip(CubicSpline(TIMES, VALUES))),
@@ -135,14 +135,12 @@ def test_a_motion_at_other_times_keeps_all_of_it(case):
 
 
 def test_a_reference_gives_named_signals_side_by_side():
-    reference = Reference(x=Profile([0.0, 1.0], [0.0, 1.0]), y=Profile([0.0], [7.0]))
-    t = times(1, 5)
+    reference, t = Reference(x=Profile([0.0, 1.0], [0.0, 1.0]), **hold(y=-2.0).signals), times(1, 5)
     got = reference(t, ("y", "x", "y"))
-    assert got.shape == (5, 3, 2)
     assert torch.equal(got[:, 1], torch.stack(reference["x"](t), -1))
     assert torch.equal(got[:, 0], got[:, 2])
+    assert got[0, 0].tolist() == [-2.0, 0.0]
     assert reference(t, ()).shape == (5, 0, 2)
-    assert hold(x=1.0, y=-2.0)(f64(3.0), ("x", "y"))[0].tolist() == [[1.0, 0.0], [-2.0, 0.0]]
 
 
 @pytest.mark.parametrize("kind", [Profile, Lines, Sampled])

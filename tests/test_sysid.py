@@ -1,10 +1,9 @@
 """Identification on a coarse mesh: derivatives, recovery of the truth, what is not identifiable,
-plans and resuming."""
+and plans."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,13 +23,12 @@ from torchsoft.sysid import (
     record,
 )
 from torchsoft.sysid.fit import Fit, gauss_newton
-from torchsoft.sysid.plan import default_plan, jacobian_error, run_plan, run_stage
+from torchsoft.sysid.plan import default_plan, jacobian_error, refine_steps, run_plan, run_stage
 from torchsoft.sysid.prediction import FailedRun
-from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.runs import Runner
 
 BASE, SENSORS = PAPER.override(COARSE), RIG
-GRASP: dict[str, Any] = {"duration": 0.65, "grasp": 0.2, "since": 0.25}
+GRASP = {"duration": 0.65, "grasp": 0.2, "since": 0.25}
 STROKES = stroked(travel=8e-3, stroke_time=0.2, **GRASP)
 SHORT = stroked(travel=8e-3, stroke_time=0.1, duration=0.25, grasp=0.1, since=0.1)
 SHAKE = Excitation(*waves(6e-3, 1e-4, (2, 12)), depth=6.8e-4, **GRASP)
@@ -216,7 +214,7 @@ def test_a_tolerance_too_coarse_for_the_data_is_reported_and_tightened():
 @pytest.mark.parametrize(("level", "stalls"), [(30.0, True), (3.0, False)])
 def test_a_fit_without_headway_ends_early_and_reports_it(level, stalls):
     """A model that cannot follow, and residuals too rough for steps to be of use; not one that is
-    near the noise."""
+    near the noise. The rough coordinate is named."""
     rough = lambda x: np.array([level, x[0] + 2.0 * np.abs(np.sin(40 * x[0])), 0.3 * x[1]])
     end = gauss_newton(optimum(ClosedForm(rough, 2), 2.0, 3.0), tolerance=1e-9)
     assert end.stalled == bool(end.findings) == stalls
@@ -224,6 +222,7 @@ def test_a_fit_without_headway_ends_early_and_reports_it(level, stalls):
     assert end.evaluations < 10 if stalls else end.evaluations == 30
     assert end.chi2 == pytest.approx(float(np.mean(rough(end.x) ** 2)))
     assert not stalls or "over 6 evaluations" in str(end.findings[0])
+    assert refine_steps(end, tightenings=2).check.rough[0] == "p0"
 
 
 @pytest.mark.parametrize(("most", "ends"), [(1.0, (0.0615, 1.0)), (4.0, (-1.0, 2.2))])
@@ -303,7 +302,7 @@ def test_residuals_are_the_same_to_the_bit_alone_with_others_and_in_threads(shor
     twin = replace(short, name="twin")
     later = replace(short, name="later", start=short.start._replace(lead=0.3))
 
-    def rows(*recordings: Recording, workers: int = 1) -> Residuals:
+    def rows(*recordings, workers=1):
         problem = Problem(recordings, SENSORS, {E: Unknown(nominal=1.1e6), TAU: Unknown()})
         x, free, runner = *(problem.coordinates.start, problem.coordinates.free), Runner
         return problem.residuals(runner(recordings, workers), x, problem.names, 1e-3, free)
@@ -313,33 +312,6 @@ def test_residuals_are_the_same_to_the_bit_alone_with_others_and_in_threads(shor
         found = rows(short, twin, later, workers=workers)
         np.testing.assert_array_equal(found.r, np.concatenate([one.r, one.r, other.r]))
         np.testing.assert_array_equal(found.J, np.concatenate([one.J, one.J, other.J]))
-
-
-@pytest.mark.slow
-def test_an_interrupted_fit_continues_and_ends_the_same_to_the_bit(short, tmp_path, monkeypatch):
-    problem = Problem([short], SENSORS, {E: Unknown(nominal=1e6)} | known(TAU, K_N, MU_S, MU_K))
-    plan = [Stage("all", ("short",), (E,), 1e-3)]
-    found = partial(identify, problem, plan=plan, tightenings=0, assumptions="trusted")
-    whole = found()
-    inner, left = Runner.run, [4]
-
-    def interrupted(self: Runner, jobs: list) -> list:
-        left[0] -= 1
-        if left[0] < 0:
-            raise KeyboardInterrupt
-        return inner(self, jobs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Runner, "run", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            found(checkpoint=tmp_path / "runs")
-    kept = len(list((tmp_path / "runs").glob("*.run")))
-    assert kept >= 3  # runs asked for twice are made once
-    again = found(checkpoint=tmp_path / "runs")
-    assert again.cost["remembered"] >= kept
-    assert again.x == whole.x
-    third = found(checkpoint=tmp_path / "runs")
-    assert third.cost["remembered"] == third.cost["simulations"] + third.cost["jacobians"]
 
 
 # What fits together
@@ -371,11 +343,3 @@ SAMPLES = np.linspace(0.0, 0.1, 5)
 def test_samples_that_are_no_recording_are_rejected(short, samples, message):
     with pytest.raises(ValueError, match=message):
         replace(short, samples=samples)
-
-
-@pytest.mark.slow
-def test_a_start_that_cannot_be_simulated_is_rejected_with_its_recording():
-    """Pads so soft that the loop is unstable."""
-    data = record("short", excited(SHORT, BASE, senses="disc"), {}, SENSORS, rtol=1e-3)
-    with pytest.raises(Unreachable, match=r"recording `short`: .* t = .* s"):
-        fit(data, {E: Unknown(nominal=4e4)})

@@ -42,33 +42,26 @@ class Case:
         return judge_residuals(parts, r, J, robust=robust)
 
     def fitted(self) -> tuple[list[Part], np.ndarray, np.ndarray]:
-        rng, at = np.random.default_rng(self.seed), 0
-        filtered = signal.butter(2, 0.1)
-        columns, rows, known = [], [], []
+        rng, known = np.random.default_rng(self.seed), []
+
+        def slow(*shape):
+            return signal.lfilter(*signal.butter(2, 0.1), rng.standard_normal(shape), axis=0)[200:]
+
         for k, m in enumerate(self.lengths):
             for channel in CHANNELS:
-                reading = signal.lfilter(*filtered, rng.standard_normal(m + 200))[200:]
+                reading = slow(m + 200)
                 e = rng.standard_normal(m) if self.noise is None else made(self.noise, m, rng)
-                columns.append(
-                    signal.lfilter(*filtered, rng.standard_normal((m + 200, 4)), axis=0)[200:]
-                )
-                rows.append(self.scale * e + self.fault.get((f"run {k}", channel), 0.0))
+                raw = self.scale * e + self.fault.get((f"run {k}", channel), 0.0)
                 known.append(
-                    (f"run {k}", channel, np.arange(m) * H, np.arange(at, at + m), reading)
+                    (f"run {k}", channel, np.arange(m) * H, reading, slow(m + 200, 4), raw)
                 )
-                at += m
-        W = [None if self.assumed is None else self.assumed.whitener(t) for _, _, t, _, _ in known]
-        J = np.concatenate([j if w is None else w @ j for w, j in zip(W, columns)])
-        y = np.concatenate([x if w is None else w @ x for w, x in zip(W, rows)])
-        x = np.linalg.lstsq(J, y, rcond=None)[0]
+        whitened = lambda t, x: x if self.assumed is None else self.assumed.whitener(t) @ x
+        J = np.concatenate([whitened(t, j) for _, _, t, _, j, _ in known])
+        y = np.concatenate([whitened(t, raw) for _, _, t, _, _, raw in known])
+        x, ends = np.linalg.lstsq(J, y, rcond=None)[0], np.cumsum([len(one[2]) for one in known])
         parts = [
-            Part(
-                *one[:4],
-                raw=raw - j @ x,
-                reading=one[4],
-                noise=self.assumed,
-            )
-            for one, raw, j in zip(known, rows, columns)
+            Part(name, channel, t, np.arange(end - len(t), end), raw - j @ x, reading, self.assumed)
+            for end, (name, channel, t, reading, j, raw) in zip(ends, known)
         ]
         return parts, y - J @ x, J
 
