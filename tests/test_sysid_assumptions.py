@@ -1,5 +1,5 @@
-"""Alternatives to a recording: each does what it states, by closed forms and by invariances;
-readings behind a low-pass."""
+"""Alternatives to a recording: each does what it states, by closed forms and by invariances; faults
+of readings at their neutral values."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,8 +1,6 @@
 """Coloured noise against dense algebra, orders that are found, intervals that keep their coverage;
 robust losses."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import linalg, optimize, signal, stats
@@ -16,7 +14,7 @@ from torchsoft.sysid.fit import (
     fisher,
     robust_loss_except_priors,
 )
-from torchsoft.sysid.noise import Autoregression, coefficients, fit_noise, log_det, reflections
+from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
 from torchsoft.sysid.residual_tests import Part
 
 H = 5e-3
@@ -92,11 +90,6 @@ def test_noise_that_grows_is_rejected(phi):
         Autoregression(phi, 1.0, H)
 
 
-def test_reflection_coefficients_there_and_back():
-    kappa = np.array([0.5, -0.9, 0.3])
-    np.testing.assert_allclose(reflections(tuple(coefficients(kappa))), kappa)
-
-
 @pytest.mark.parametrize(("name", "kept"), [("white", 0.9), ("two", 1.0), ("four", 0.9)])
 def test_order_and_coefficients_are_found_over_several_recordings(name, kept):
     phi, rng, series = PROCESSES[name], np.random.default_rng(3), []
@@ -137,7 +130,7 @@ def test_losses_are_scipys_and_leave_priors_quadratic(loss: Loss):
     rng = np.random.default_rng(0)
     J, y = rng.standard_normal((60, 2)), 3 * rng.standard_normal(60)
 
-    def fit(by: Any, prior: float = 0.0) -> Any:
+    def fit(by, prior=0.0):
         return optimize.least_squares(
             lambda x: np.append(J @ x - y, prior * (x - 2.0)), [0.0, 0.0], loss=by,
             f_scale=REACH[loss], xtol=1e-14, ftol=1e-14,

@@ -44,8 +44,8 @@ FAR = {
 
 PRESS = {"kind": "sines", "components": [{"amplitude": 5e-4, "frequency": 12.0}]}
 ABOUT = "about the disc"
-STROKE: dict[str, Any] = {"duration": 0.9, "grasp": 0.2, "since": 0.25}
-SHAKE: dict[str, Any] = {"duration": 0.9, "grasp": 0.2, "since": 0.325}
+STROKE = {"duration": 0.9, "grasp": 0.2, "since": 0.25}
+SHAKE = {"duration": 0.9, "grasp": 0.2, "since": 0.325}
 MOTIONS = {
     "rolling": stroked(15e-3, stroke_time=0.2, **STROKE),
     "shaking": Excitation(*waves(6e-3, 2e-4, (4.0, 17.0)), depth=2.8e-4, **SHAKE),
@@ -117,7 +117,7 @@ def late(by: float) -> Callable[[Any, Any], Any]:
 
 
 NO_F = {"effort_x": None, "effort_y": None}
-MISTAKES: dict[str, tuple[str, Callable[[Recording], Recording], str, str]] = {
+MISTAKES = {
     "sign of a force": (
         "rolling", lambda r: changed(r, effort_x=scaled(-1)), "sign of effort_x", "opposite"
     ),
@@ -232,10 +232,10 @@ def test_recordings_are_checked_where_gains_are_unknown_and_assumptions_trusted(
 
 
 def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_named(recordings):
-    rig: Any = deepcopy(recordings["rolling"].rig)
+    rig = deepcopy(recordings["rolling"].rig)
     loop = rig.actuators["x"]
 
-    def both(w: Any, w_dot: Any, feed: Any, q: Any, q_dot: Any) -> Any:
+    def both(w, w_dot, feed, q, q_dot):
         return loop.law(w[..., 0], w_dot[..., 0], feed, q[..., 0], q_dot[..., 0]) + 0.0 * q[..., 1]
 
     senses = [loop.measured, "disc.theta"]
@@ -293,7 +293,7 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(
 ):
     one = at_rows(recordings[motion], 1000.0, rates=True)
     x_d = one.rig.reference["x_d"]
-    other: Any = Sampled(clock * x_d.times, x_d.values.detach(), factor * x_d.rates)
+    other = Sampled(clock * x_d.times, x_d.values.detach(), factor * x_d.rates)
     (found,) = setpoint_findings(noted(one, x_d=other), SENSORS)
     assert found.facts["name"] == ("rate of x_d" if clock == 1.0 else "set-points x_d")
     assert (found.severity == "error") == (clock == 1.0)
@@ -301,7 +301,7 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(
 
 
 def test_findings_of_a_kind_are_reported_once_and_reject_unless_acknowledged():
-    def finding(code: str, severity: Any, name: str, recording: str) -> Finding:
+    def finding(code, severity, name, recording):
         facts = {"name": name, "recording": recording, "channel": "F_x", "correlation": -0.9}
         return Finding(code, severity, facts | {"ratio": 20.0})
 

@@ -1,15 +1,10 @@
-"""Profiles against closed forms, and combinations of parameters; both on a rig."""
+"""Profiles against closed forms, and combinations of parameters."""
 
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
-from conftest import COARSE, PAPER, RIG, excited
-from test_sysid import fit
 
-from torchsoft.rigs.excite import Excitation
-from torchsoft.sysid import Problem, Unknown, record
 from torchsoft.sysid.fit import Combination, combinations
-from torchsoft.sysid.profile import optimum as of_answer
 from torchsoft.sysid.profile import profiles
 
 E, K_N = "materials.rubber.E", "laws.steel_on_rubber.K_n"
@@ -83,24 +78,3 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters():
     assert product.formula == "E * K^0.4"
     assert seen(*np.eye(3).tolist()) == []  # all of them are seen
     assert seen([1, 0, 0]) == []  # K and R are not seen at all
-
-
-@pytest.mark.slow
-def test_profile_and_combination_of_stiffnesses_in_series():
-    """Pads and contacts share the load: a motion that hardly slips sees their stiffness in series.
-    Soft contacts need stiffer pads than stiff contacts need soft ones."""
-    roll = {"kind": "profile", "times": [0.1, 0.25], "values": [0.0, 4e-3], "offset": "start"}
-    built = excited(Excitation(roll, duration=0.25, grasp=0.1), PAPER.override(COARSE))
-    sensors = {k: one.model_copy(update={"noise": 4 * one.noise}) for k, one in RIG.items()}
-    data = record("roll", built, {}, sensors, seed=1)
-    unknowns = {E: Unknown(), K_N: Unknown()}
-    result = fit(data, unknowns, 1e-4, sensors, tightenings=0)
-    o = of_answer(Problem([data], sensors, unknowns), result)
-    (one,) = profiles(o, [E])
-    low, high = one.ci95
-    assert low < 0.75e6 < high
-    assert high - one.best > 1.3 * (one.best - low)
-    assert (np.diff(one.others[K_N]) < 0).all()
-    (both,) = combinations(o.labels, o.covariance, 0.1)
-    assert both.exponents == {E: 1.0, K_N: pytest.approx(0.09, abs=0.02)}
-    assert both.sd < 0.2 * min(both.sds.values())

@@ -1,8 +1,7 @@
-"""Faults and ranges of sensors, priors and places of a start, as coordinates of a fit."""
+"""Faults and ranges of sensors, and priors, as coordinates of a fit."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +61,7 @@ def turned(of: Signals, angle: float, t: np.ndarray) -> np.ndarray:
 
 MIDDLE = 0.175
 """Of the samples [s]."""
-READINGS: dict[str, tuple[str, str, float, Callable[[Signals, float, np.ndarray], np.ndarray]]] = {
+READINGS = {
     "bias": ("x_C", "m", 1e-3, lambda of, size, t: of["x_C"](t) + size),
     "delay": ("x_C", "s", 4e-3, lambda of, size, t: of["x_C"](t - size)),
     "gain": ("x_C", "1", 0.2, lambda of, size, t: (1 + size) * of["x_C"](t)),
@@ -105,37 +104,6 @@ def test_a_fault_reads_as_its_closed_form_and_has_its_derivatives(dense, strokes
     np.testing.assert_allclose(at - neutral, change, atol=0.01 * np.abs(change).max())
     assert np.abs(neutral - stated).max() < 0.1 * plain.noise
     check_derivatives(problem, x, 1e-4, 1e-4, only=[c.labels[i], E], runner=runner)
-
-
-@pytest.mark.slow
-def test_every_other_kind_of_coordinate_has_its_derivatives(strokes):
-    """Of ratios, of values of each recording, linear ones, those with a prior, a place of the disc,
-    and a sensor that is saturated."""
-    start = strokes.start._replace(position_sd={"disc.x": 1e-4})
-    moved = replace(strokes, name="moved", start=start)
-    sensors = {
-        "x_C": Sensor(noise=1e-5, bias=1e-3, per="recording"),
-        "effort_x": Sensor(noise=0.1, high=1.0),
-    }
-    unknowns = {
-        E: Unknown(prior=Prior(median=8e5, sd=1e5)),
-        f"{LAW}.friction.v_s": Unknown(prior=Prior(median=5e-3, sd=1.0, kind="log-normal")),
-        f"{LAW}.R_n": Unknown(per="recording"),
-        MU_S: Unknown(),
-        MU_K: Unknown(ratio_to=MU_S, high=1.0, low=0.3),
-        "bodies.disc.mass": Unknown(scale="linear", low=0.3, high=0.5),
-    }
-    problem = Problem([moved], sensors, unknowns)
-    c = problem.coordinates
-    assert {f"{LAW}.R_n in moved", f"{MU_K} / {MU_S}", "bias of x_C in moved"} <= {*c.labels}
-    rng, (low, high) = np.random.default_rng(0), c.bounds
-    x = c.start + 0.05 * rng.standard_normal(len(c)) * np.minimum(1, high - low)
-    rows = len(problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3).r)
-    assert rows == problem.samples() + 3  # of the priors, the place's own among them
-    assert sensors["effort_x"].saturated(strokes.samples["effort_x"][1]).any()
-    place = "start.disc.x in moved"
-    check_derivatives(problem, x, 1e-3, 1e-4, only=[one for one in c.labels if one != place])
-    check_derivatives(problem, x, 1e-3, 1e-6, h=1e-6, only=[place])  # a kink is near
 
 
 def test_a_prior_is_one_more_measurement(strokes):
@@ -199,7 +167,7 @@ def test_residuals_that_saturation_changed_are_not_judged(strokes):
     measured = np.clip(y + noise * rng.standard_normal(len(t)), -limit, limit)
     measured[np.argmax(y)] = 0.0  # a sample that is lost
     cut = replace(strokes, samples={"effort_x": (t, measured)})
-    problem: Any = Problem([cut], {"effort_x": sensor}, {E: Unknown()})
+    problem = Problem([cut], {"effort_x": sensor}, {E: Unknown()})
     r, _ = tobin(noise, limit).residuals(y, measured)
     (part,) = parts(problem, r, ["strokes"])
     assert part.saturated > 0.5 * len(t)

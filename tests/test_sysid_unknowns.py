@@ -29,7 +29,7 @@ def coordinates(*others: dict[str, float], **unknowns: dict[str, Any]) -> Coordi
         full(name): Unknown(**{k: full(x) if k == "ratio_to" else x for k, x in one.items()})
         for name, one in unknowns.items()
     }
-    recordings: list[Any] = [
+    recordings = [
         SimpleNamespace(
             name=name, rig=RIG, start_coordinates=(),
             parameters=GIVEN | {full(key): x for key, x in one.items()},
@@ -136,7 +136,7 @@ def test_a_search_starts_where_all_rigs_are_or_where_nominal_states(others, name
 
 
 def test_a_name_means_one_thing_and_is_given_once():
-    other: Any = SimpleNamespace(short={"theta": "theta_ball"})
+    other = SimpleNamespace(short={"theta": "theta_ball"})
     assert in_full([RIG, other], {"F_x": 1, "theta_C": 2}) == {"effort_x": 1, "theta_C": 2}
     with pytest.raises(ValueError, match="`theta_C` and `theta` are one, given twice"):
         in_full([RIG], {"theta": 1, "theta_C": 2})
