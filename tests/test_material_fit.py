@@ -164,14 +164,6 @@ def test_a_term_that_the_rows_do_not_determine_is_left_out():
     assert f"but {found.terms} are taken: the rows do not determine E_1" in found.notices[-1]
 
 
-def test_a_compliance_over_decades_counts_row_by_row():
-    """A power law over twelve decades of time: the series is as good at the first row."""
-    t = np.geomspace(1e-8, 1e4, 61)
-    found = fit(of(1e-6 * t**0.4, np.ones_like(t), t, "creep", per_load=True))
-    assert "of each row" in found.described
-    assert np.abs(found.residual / found.measured.answer).max() < 0.2
-
-
 @pytest.mark.parametrize(
     ("stress", "terms", "words"),
     [
@@ -271,12 +263,6 @@ def test_energies_are_found_again_from_three_kinds_of_tests(kind, tmp_path):
         assert nominal_stress(made, test, x) == pytest.approx(expected, rel=1e-5, abs=10)
 
 
-def test_an_exponent_may_pass_zero(tmp_path):
-    """In the search for the one term of a material that has two of opposite signs."""
-    found = fit_energy(pulls(tmp_path, TRUE["ogden"], "tension", "shear"), "ogden", nu=0.49)
-    assert found.rms < 0.02
-
-
 def test_noise_shows_in_the_standard_deviation(tmp_path):
     found = fit_energy(
         pulls(tmp_path, TRUE["neo_hookean"], "tension", noise=0.02), "neo_hookean", nu=0.49
@@ -291,7 +277,7 @@ def test_true_stress_counts_in_either_sign(test, end, sign, tmp_path):
     """True stress is E / 3 (x^2 - 1 / x), whichever direction counts as positive."""
     x = np.linspace(1, end, 21)[1:]
     made = {"strain [1]": sign * (x - 1), "stress [Pa]": sign * 2e5 * (x**2 - 1 / x)}
-    rows: Any = read(table(tmp_path / "t.csv", made), test=test, whole=True, true=True)
+    rows = read(table(tmp_path / "t.csv", made), test=test, whole=True, true=True)
     found = fit_energy([rows], "neo_hookean", nu=0.49)
     assert found.values["E"] == pytest.approx(2 * 1.49 * 2e5, rel=1e-9)
 
@@ -306,26 +292,6 @@ def test_unphysical_energies_are_rejected(tmp_path):
     soft = fit_energy(made(1e-3 * x), "neo_hookean", nu=0.49)
     with pytest.raises(ValueError, match=r"parameter `E` must be from 1 to .* but is 0\.00"):
         write(soft, tmp_path, SOFT, {})
-
-
-STIFFENING = np.fromstring(
-    "0 0.25739 0.420847 0.518429 0.609233 0.659472 0.725627 0.756164 0.812768 0.834691 0.889458 "
-    "0.909682 0.968974 0.993877 1.064964 1.101971 1.194328 1.252889 1.379243 1.471617 1.648954 "
-    "1.790940 2.041571",
-    sep=" ",
-)
-"""Stress [MPa] at stretches from 1 to 7.38, which stiffens as natural rubber does."""
-
-
-@pytest.mark.parametrize(
-    ("terms", "rms"), [(2, 0.00515), pytest.param(3, 0.00509, marks=pytest.mark.slow)]
-)
-def test_ogdens_exponents_are_bounded_so_that_no_power_overflows(terms, rms, tmp_path):
-    x = np.linspace(0, 6.38, len(STIFFENING))
-    made = Pull(tmp_path / "p.csv", "tension", x, 1e6 * STIFFENING, (0.0, 6.38), ())
-    found = fit_energy([made], "ogden", nu=0.49, terms=terms)
-    assert found.rms < rms
-    assert any("at the limit of exponents" in one for one in found.notices) == (terms == 3)
 
 
 def test_what_one_test_does_not_tell_is_reported(tmp_path):
@@ -362,8 +328,8 @@ SAME = [
 
 @pytest.mark.parametrize(("made", "how"), SAME, ids=[" ".join(one) for one, _ in SAME])
 def test_every_column_and_unit_reads_the_same(made, how, tmp_path):
-    found: Any = read(table(tmp_path / "test.csv", made), **how)
-    expected: Any = {"relaxation": relaxing(), "creep": creeping(), "sweep": swept()}[found.test]
+    found = read(table(tmp_path / "test.csv", made), **how)
+    expected = {"relaxation": relaxing(), "creep": creeping(), "sweep": swept()}[found.test]
     assert ("compliance" in " ".join(made)) == (found.test == "creep")
     assert np.allclose(found.t, expected.t, rtol=1e-12, atol=1e-15)
     scale = expected.driven if found.test != "sweep" and found.per_load else 1.0
@@ -378,7 +344,7 @@ TRIANGLE = {"strain [1]": 10 - abs(10 - COUNT), "stress [Pa]": 10 - abs(10 - COU
 PULLED = {"test": "tension", "whole": True}
 PRESSED = {"test": "compression", "whole": True}
 FROM_NOTHING = {"t [s]": COUNT, "strain [1]": -0.1 * COUNT, "stress [Pa]": -COUNT}
-WRONG: list[tuple[Mapping[str, Any], dict[str, Any], str]] = [
+WRONG = [
     ({"t [s]": COUNT, "stress [Pa]": ONES}, {}, "needs one of the columns strain, stretch"),
     (HELD | {"stretch [1]": ONES}, {}, "but has strain and stretch"),
     (TRIANGLE, {}, "has no column `t`"),
@@ -426,8 +392,6 @@ FITTED = ["--test", "tension", "--nu", "0.49", "--energy"]
 COMMANDS = {
     "relaxing": (lambda f: plain(f, relaxing(2e-3)), ["--nu", "0.49", "--depth", "0.02"],
         "prony of 3 terms", 2e5),
-    "creeping": (lambda f: plain(f, creeping(2e-3)), [], "generalised_kelvin of 2", 1e6 / 3.5),
-    "sweep": (lambda f: table(f / "test.csv", SAME[5][0]), [], "prony of 2 terms", 4e5),
     "pull": (lambda f: table(f / "test.csv", pull()), ["--test", "tension", "--range", "0", "0.1",
         "--length", "0.02", "--area", "6e-6", "--tau", "0.02"], "kelvin_voigt, residual", 0.76e6),
     "energy": (lambda f: table(f / "test.csv", columns("tension", TRUE["ogden"])), [*FITTED,
@@ -476,10 +440,8 @@ def test_a_torn_specimen_is_read_up_to_where_it_tore(tmp_path):
     with pytest.raises(ValueError, match=r"row 35: the stress falls .*a stretch of 2.6") as error:
         read(path, test="tension", whole=True)
     low, high = map(float, str(error.value).split("--range")[1].split())
-    rows: Any = read(path, test="tension", strains=(low, high))
-    found = fit_energy([rows], "neo_hookean", nu=0.49)
-    assert found.values["E"] == pytest.approx(2 * 1.49 * 29e3, rel=1e-4)
-    assert any("6 rows from row 35 to row 40: strains above 1.6" in x for x in found.notices)
+    rows = read(path, test="tension", strains=(low, high))
+    assert (rows.strain[-1], len(rows.strain)) == (pytest.approx(1.6), 33)
 
 
 OPTIONS = [
