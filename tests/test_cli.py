@@ -10,7 +10,6 @@ import shlex
 import signal
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +96,7 @@ def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments, message
     assert message.split()[-1] in err.splitlines()[-1]
 
 
-ERRORS: list[tuple[str, str]] = [
+ERRORS = [
     ("identify data.csv", "one CONFIG.toml is needed, but 0 were given"),
     ("identify other.csv rig.toml", "other.csv: No such file or directory"),
     ("identify folder.csv rig.toml", "folder.csv: Is a directory"),
@@ -152,12 +151,6 @@ def test_neither_locale_nor_window_system_matters(tmp_path):
     assert re.fullmatch(rb"torchsoft: error: \\u\w+\\u\w+\.toml: No such.*\n", ended.stderr)
 
 
-def test_a_fitted_material_has_the_assumed_numbers_that_the_test_does_not_tell(folder):
-    assert main(["material", "fit", "test.csv", "--rho", "1200"]) == 0
-    (table,) = tomllib.loads(Path("out/material/material.toml").read_text())["materials"].values()
-    assert (table["depth"], table["nu"], table["rho"]) == (44e-3, 0.45, 1200.0)
-
-
 # identification
 # ----------------------------------------------------------------------
 
@@ -186,7 +179,9 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder, 
 def answered(tmp_path_factory):
     """The command, carried out in this process; its folder and its arguments."""
     folder = tmp_path_factory.mktemp("command")
-    (folder / "rig.toml").write_text(f'{CONFIG}assumptions = "trusted"\ntightenings = 0\n')
+    config = CONFIG.replace('[unknowns."laws.steel_on_rubber.K_n"]\nnominal = 1e5\n', "")
+    config = config.replace("[settings]", "[settings]\nlaws.steel_on_rubber.K_n = 47e3")
+    (folder / "rig.toml").write_text(f'{config}assumptions = "trusted"\ntightenings = 0\n')
     command = ["identify", str(recorded(folder / "data.csv", 22)), str(folder / "rig.toml")]
     assert main([*command, "--out", str(folder / "out"), "--no-progress"]) == 0
     return folder, command
@@ -201,8 +196,7 @@ def test_it_writes_answer_and_page(answered):
     out = folder / "out"
     assert {path.name for path in out.iterdir()} == {"answer.json", "report.html"}
     found = answer(out)
-    names = {one["name"] for one in found["estimates"]}
-    assert names == {"laws.steel_on_rubber.K_n", "materials.rubber.E"}
+    assert [one["name"] for one in found["estimates"]] == ["materials.rubber.E"]
     line = shlex.join(["torchsoft", *command, "--out", str(out), "--no-progress"])
     assert found["command"] == line
     page = (out / "report.html").read_text()
@@ -213,11 +207,11 @@ def test_it_writes_answer_and_page(answered):
 def test_profiles_are_those_of_the_answer(answered, capsys):
     folder, (_, *files) = answered
     out, found = folder / "profile", answer(folder / "out")
-    options = ["--answer", str(folder / "out" / "answer.json"), "--of", "contact.K_n"]
+    options = ["--answer", str(folder / "out" / "answer.json"), "--of", "pad.E"]
     assert main(["profile", *files, *options, "--out", str(out), "--no-progress"]) == 0
     (one,) = json.loads((out / "profile.json").read_text())
     (stated,) = (e for e in found["estimates"] if e["name"] == one["label"])
-    assert one["label"] == "laws.steel_on_rubber.K_n"
+    assert one["label"] == "materials.rubber.E"
     assert one["best"] == pytest.approx(stated["last"])
     assert one["wald95"] == pytest.approx(stated["ci95"], rel=0.05)
     assert "written to" in capsys.readouterr().out
@@ -234,7 +228,7 @@ def test_options_come_before_the_configuration(answered, capsys):
     assert not kept.exists()  # a checkpoint is removed once the answer is there
     text, err = capsys.readouterr()
     assert str(out / "answer.json") in text
-    assert "laws.steel_on_rubber.K_n" in text
+    assert "materials.rubber.E" in text
     assert err == ""
 
 
@@ -256,18 +250,6 @@ def test_competing_laws_are_compared(folder, capsys):
     found = json.loads((folder / "out" / "comparison.json").read_text())
     assert {one["name"] for one in found["laws"]} == {"as stated", "coulomb"}
     assert found["verdict"] in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_an_interrupt_among_the_assumptions_draws_nothing(folder, monkeypatch, capsys):
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("torchsoft.sysid.sensitivity.difference_column", interrupted)
-    recorded(folder / "data.csv", 42)
-    assert identify() == 130
-    assert {*os.listdir("out")} == {"answer.json", "unfinished"}
-    assert "interrupted; the same command continues" in capsys.readouterr().err
 
 
 # streams, signals and names
@@ -296,7 +278,7 @@ def test_a_closed_stream_is_no_reason_to_do_nothing(name, monkeypatch, tmp_path)
 
 
 def test_a_file_to_start_from_is_whole_or_not_there(monkeypatch, tmp_path, capsys):
-    def full(*_: object, **__: object) -> None:
+    def full(*_, **__):
         raise OSError(28, "No space left")
 
     path = tmp_path / "rig.toml"

@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 from conftest import f64
 
@@ -62,24 +63,14 @@ def test_a_rig_that_grasps_is_excited(rig):
     values = followed(built, 0.0, 0.375, SINCE, 0.8, 1.0)
     assert values["y_d"] == pytest.approx([y, *[y + GRIP - 1e-3] * 4], abs=1e-15)
     assert values["x_d"] == pytest.approx([x, x, x, x + 4e-3, x + 4e-3], abs=1e-15)
-    held = built.rig.unpack(built.rig.state({
-        body: {"x": state.pose[body][0].item(), "y": "rest"},
-        "bracket": {"x": x, "y": {"depth": 1e-3}},
-    }))  # fmt: skip
-    assert y - held.pose["bracket"][1].item() == pytest.approx(1e-3 - GRIP, abs=1e-15)
-    light, force = (float(one.pads[upper][0][:, 1].detach().sum()) for one in (state, held))
+    held = built.rig.state({body: {"x": state.pose[body][0].item(), "y": "rest"},
+                            "bracket": {"x": x, "y": {"depth": 1e-3}}})  # fmt: skip
+    light, force = (
+        float(one.pads[upper][0][:, 1].detach().sum()) for one in (state, built.rig.unpack(held))
+    )
     assert values["F_ff"] == pytest.approx([-light, *[-force] * 4], rel=1e-6)
     assert changed.names.keys() == file.names.keys()
     assert changed.materials == file.materials
-
-
-def test_an_excitation_runs():
-    file = coarse("paper").override({"contact.v_s": 0.05})
-    run = excite(file, Excitation(ROLL, duration=0.8)).build().run(rtol=1e-3)
-    x, body = run["x_Br"], run["x_C"]
-    assert (body[run.t <= SINCE] - body[0]).abs().max() < 1e-4  # gripped, it does not roll off
-    assert float(x[-1]) == pytest.approx(64.3e-3, abs=4e-4)  # the loop deflects under friction
-    assert all(float(F[-1, :, 0].sum()) > 10.0 for F in run.force.values())
 
 
 def test_a_loop_may_sense_the_manipulated_body():
@@ -97,11 +88,10 @@ def test_shaking_is_along_and_across():
     times = [0.01 * i for i in range(50, 200)]
     one, again = (followed(excite(file, "shaking").build(), *times) for _ in range(2))
     assert one == again
-    x, y = ([v - row[0] for v in row] for row in (one["x_d"], one["y_d"]))
-    assert 1e-3 < max(map(abs, x)) <= 10e-3
-    assert 2e-5 < max(map(abs, y)) <= 2e-4
-    scaled = [v * max(map(abs, x)) / max(map(abs, y)) for v in y]
-    assert max(abs(a - b) for a, b in zip(x, scaled)) > 1e-3
+    x, y = (np.subtract(one[name], one[name][0]) for name in ("x_d", "y_d"))
+    assert 1e-3 < abs(x).max() <= 10e-3
+    assert 2e-5 < abs(y).max() <= 2e-4
+    assert abs(np.corrcoef(x, y)[0, 1]) < 0.9
 
 
 # rejections

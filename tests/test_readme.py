@@ -50,7 +50,15 @@ ELSEWHERE = {
     "out/rolling": "test_datasets_read.py",
 }
 """Parts of blocks that need more than a test has, and where they are tried instead."""
-LONG = "laboratory", "identification", "reduced"
+LONG = (
+    "laboratory",
+    "identification",
+    "reduced",
+    "custom_friction",
+    "dataset",
+    "batches",
+    "materials",
+)
 """Pages that take seconds."""
 DATASET = "data_gen"
 """Page whose Python reads what its commands have made."""
@@ -119,7 +127,7 @@ def folder(tmp_path, monkeypatch):
 def test_python_runs(page, folder):
     if "IPython" in code(page):
         pytest.importorskip("IPython")
-    names: dict[str, object] = {}
+    names = {}
     exec(code(page), names)
     if page.stem == "running":
         assert names["s"].sensitivities.shape == (101, 10, 2)
