@@ -8,11 +8,9 @@ import pytest
 import torch
 
 from torchsoft import BuiltRig, RigFile, Trajectory, simulate, simulate_batch
-from torchsoft.plan import Target, plan
 from torchsoft.sysid import Standing
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Grid, Recording
-from torchsoft.testing import check_gradients
 
 E, MASS = "materials.rubber.E", "bodies.disc.mass"
 COARSE = {f"pads.{pad}.elements_{axis}": n for pad in ("lower", "upper")
@@ -106,32 +104,6 @@ def test_every_run_of_a_batch_starts_at_its_own_parameters():
         run["y_disc"][-1].backward()
         assert (batch["y_disc"][i] - run["y_disc"]).abs().max() < 1e-8
         assert moduli.grad[i].item() == pytest.approx(alone.rig.parameter(E).grad.item(), rel=1e-6)
-
-
-@pytest.mark.slow
-def test_a_check_of_gradients_moves_the_start():
-    built = TOUCHING.build()
-    t = built.t[:3]
-    (one,) = check_gradients(
-        built.rig, t, built.initial, wrt=[E], of=["y_disc"], step_error=False
-    ).derivatives
-    assert one.difference == pytest.approx(one.adjoint, rel=1e-4)
-    held = built.run(t, y0=built.y0, gradient="discrete")["y_disc"][-1]
-    (slope,) = torch.autograd.grad(held, built.rig.parameter(E))
-    assert abs(one.adjoint - 0.75e6 * float(slope)) > 0.1 * abs(one.adjoint)
-
-
-@pytest.mark.slow
-def test_a_plan_for_a_parameter_moves_the_start():
-    built = TOUCHING.build()
-    t, at = built.t[:2], 0.7e6
-    goal = float(TOUCHING.override({E: at}).build().run(t)["y_disc"][-1])
-    target = Target(channel="y_disc", value=goal, tolerance=1e-8)
-    found = plan(
-        built.rig, t, {E: (0.65e6, 0.8e6)}, targets={"y": target}, y0=built.initial, iterations=5,
-    )  # fmt: skip
-    assert found.reached
-    assert float(found.parameters[E]) == pytest.approx(at, rel=2e-3)
 
 
 def test_identification_follows_the_start_and_its_set_points():

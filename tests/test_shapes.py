@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline
 
 from torchsoft import (
-    Body,
     Circle,
     Contour,
     Eccentric,
@@ -47,7 +46,7 @@ def pear(count: int = 60) -> Array:
 
 
 def superellipse(a: float, b: float, n: float) -> Boundary:
-    def at(s: Array) -> Array:
+    def at(s):
         way = np.stack((np.cos(TAU * s), np.sin(TAU * s)), -1)
         return way / ((np.abs(way / [a, b]) ** n).sum(-1, keepdims=True)) ** (1 / n)
 
@@ -67,7 +66,7 @@ def rounded(vertices: list[list[float]], radius: float) -> Boundary:
     lengths = np.stack((radius * abs(turn), abs(sides)), -1).ravel()
     start = np.concatenate(([0.0], np.cumsum(lengths)))
 
-    def at(s: Array) -> Array:
+    def at(s):
         way = (s % 1.0) * start[-1]
         k = np.searchsorted(start, way, side="right") - 1
         i, part = k // 2, (way - start[k]) / lengths[k]
@@ -98,7 +97,7 @@ def contour() -> Contour:
 CONTROL = lambda: spline(contour().control.detach().numpy())
 
 # A new shape is one line: how it is made, and its boundary, about any point.
-CASES: dict[str, tuple[Callable[[], Shape], Callable[[], Boundary]]] = {
+CASES = {
     "circle": (lambda: Circle(R), lambda: superellipse(R, R, 2.0)),
     "ellipse": (lambda: Ellipse(20e-3, 12e-3), lambda: superellipse(20e-3, 12e-3, 2.0)),
     "squircle": (lambda: Superellipse(20e-3, 14e-3, 4.0), lambda: superellipse(20e-3, 14e-3, 4.0)),
@@ -253,15 +252,6 @@ def test_copies_are_the_shape(case):
         assert torch.equal(given[:, 0], expected)
 
 
-def test_a_uniform_body_has_mass_and_inertia_of_its_shape():
-    body = Body.uniform(RoundedBox(20e-3, 10e-3, 1e-12), density=7800.0, depth=44e-3, theta=0.0)
-    mass = body.mass.item()
-    assert mass == pytest.approx(7800 * 44e-3 * 40e-3 * 20e-3, rel=1e-12)
-    assert body.inertia.item() == pytest.approx(mass * (40e-3**2 + 20e-3**2) / 12, rel=1e-12)
-    (slope,) = torch.autograd.grad(body.inertia, body.shape.half_width)
-    assert float(slope) == pytest.approx(mass * 2 * 20e-3 / 3, rel=1e-9)
-
-
 # contours through points
 
 
@@ -314,28 +304,6 @@ def test_a_body_held_upright_although_its_pad_would_turn_it_is_warned_about():
     tilted = {"pads.ground.angle": 0.2, "bodies.ellipse.start": {"x": 0.06, "y": "rest"}}
     with pytest.warns(UserWarning, match="`ellipse` is held at theta = 0, where the pads turn it"):
         RigFile.ready("drop").override(tilted).build()
-
-
-ECCENTRIC = RigFile.ready("drop").override({
-    "bodies.ellipse.shape": {"kind": "circle", "radius": 19e-3}, "bodies.ellipse.centre_y": -4e-3,
-    "bodies.ellipse.mass": 0.4, "bodies.ellipse.inertia": 8e-5,
-    "bodies.ellipse.start": {"x": 60e-3, "y": "rest", "theta": 0.05, "v_x": 0.0},
-    "materials.gel.E": 1e6, "materials.gel.tau": 1e-4, "laws.dry.K_n": 1e6, "laws.dry.K_t": 1e6,
-    "pads.ground.elements_x": 240, "pads.ground.elements_y": 6, "outputs.duration": 0.6,
-    "outputs.snapshots": [],
-})  # fmt: skip
-"""A disc with its centre of mass below that of its area, which rocks on a pad."""
-
-
-def test_an_eccentric_disc_rocks_like_a_pendulum():
-    run = ECCENTRIC.build().run(rtol=1e-5)
-    theta, t = run["theta_ellipse"].numpy(), run.t.numpy()
-    down = np.flatnonzero((theta[:-1] > 0) & (theta[1:] <= 0))
-    part = theta[down] / (theta[down] - theta[down + 1])
-    period = np.diff(t[down] + (t[down + 1] - t[down]) * part)
-    m, e, radius, J, g = 0.4, 4e-3, 19e-3, 8e-5, 9.81
-    expected = TAU * np.sqrt((J + m * (radius - e) ** 2) / (m * g * e))
-    assert period == pytest.approx(expected, rel=0.01)
 
 
 def test_a_centre_of_mass_without_a_shape_is_rejected():
