@@ -1,5 +1,5 @@
 """The independent simulator: it shares nothing with torchsoft and agrees with it where the
-assumptions are equal; each of its deviations does what its name says."""
+assumptions are equal; what its deviations do is measured in `experiments/validation/suspects`."""
 
 import ast
 import re

@@ -57,7 +57,7 @@ GOAL = {
 
 
 def planned(free: Free = FREE, **how: Any) -> Plan:
-    options: dict[str, Any] = {"y0": BUILT.y0, "rtol": 1e-3} | how
+    options = {"y0": BUILT.y0, "rtol": 1e-3} | how
     return plan(BUILT.rig, BUILT.t, free, **options)
 
 
@@ -144,16 +144,6 @@ def test_a_limit_is_kept_at_a_price(turned):
     assert float(found.trajectory["effort_left_x"][50:].min()) >= low * (1 - 2e-3)
 
 
-@pytest.mark.slow
-def test_an_objective_is_lowered_within_targets():
-    """The least work of a finger that may choose its gain, over two draws."""
-    objective = lambda run: run["effort_left_y"].square().mean()
-    over = {"laws.dry.K_n": torch.tensor([1e5, 1.1e5])}
-    found = planned(FREE, objective=objective, targets={"turn": TURN}, over=over, iterations=3)
-    assert (found.made_by["draws"], found.holds) == (2, 1.0)
-    assert found.value <= found.history[0].value or found.history[0].missed > 0
-
-
 def test_adam_lowers_squared_errors():
     found = planned(targets={"turn": TURN}, method="adam", iterations=15, rate=0.03)
     assert abs(float(found.errors["turn"][0])) < 0.5 * 20.0  # from 20 tolerances
@@ -200,7 +190,7 @@ def test_runs_that_fail_are_worse_and_an_interrupt_keeps_the_best(monkeypatch, c
     """A plan whose finer run fails is not reached."""
     evaluate, number = Evaluator.evaluate, count(1)
 
-    def failing(self: Evaluator, z: Any, rtol: float | None = None, **how: Any) -> Any:
+    def failing(self, z, rtol=None, **how):
         found, i = evaluate(self, z, rtol, **how), next(number)
         if (self.rtol if rtol is None else rtol) < 1e-3 if case == "finer" else i == 2:
             found.failure = "draw 0: made to fail"
