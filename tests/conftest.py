@@ -215,7 +215,7 @@ def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
     }
     generator = torch.Generator().manual_seed(seed)
 
-    def moved(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
+    def moved(part, scale):
         noise = {
             name: torch.randn(x.shape, generator=generator, dtype=torch.float64)
             for name, x in part.items()

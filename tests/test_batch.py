@@ -9,7 +9,6 @@ import torch
 from conftest import COARSE, coarse, f64, grasped, still, times
 
 from torchsoft import (
-    Batch,
     Circle,
     Reference,
     Rig,
@@ -98,7 +97,7 @@ def test_references_times_and_rigs_of_their_own(start):
     again = simulate_batch([model, other], ts, knots=knots, **how)
     assert float((again.y - batch.y)[batch.mask].abs().max()) < 1e-9
     finer = coarse(pad__elements_x=80)
-    batch: Batch = simulate_batch([model, finer], T, y0=[y0[0], grasped(finer)], rtol=1e-3)
+    batch = simulate_batch([model, finer], T, y0=[y0[0], grasped(finer)], rtol=1e-3)
     assert batch["x_C"].shape == (2, 5)
     with pytest.raises(ValueError, match="rows have different shapes"):
         _ = batch.y
@@ -152,9 +151,9 @@ def test_what_no_batch_can_be_is_rejected(given, match):
 
 def test_work_side_by_side_waits_and_stops():
     """Results of every number; grad mode as outside; an exception ends what has not started."""
-    started: list[int] = []
+    started = []
 
-    def work(i: int) -> tuple[int, bool]:
+    def work(i):
         started.append(i)
         if i == 2:
             raise KeyError(i)

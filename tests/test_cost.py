@@ -9,7 +9,7 @@ import pytest
 from conftest import still
 
 from torchsoft.cli import main
-from torchsoft.cost import Cost, Costly, agree, duration, rig_row, rig_step
+from torchsoft.cost import Cost, Costly, agree, rig_row, rig_step
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost
 from torchsoft.rigs.written import template, to_toml
@@ -34,14 +34,6 @@ def test_hours_and_memory_need_the_users_word(price):
             agree(price, False, "take less")
         keys.readline.return_value = "y\n"
         agree(price, False, "take less")
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.5, "0.5 seconds"), (80.0, "80 seconds"), (600.0, "10 minutes"), (2.5e5, "2.9 days")],
-)
-def test_times_are_stated_in_their_unit(seconds, words):
-    assert duration(seconds) == words
 
 
 def test_a_step_costs_more_on_a_finer_mesh_and_with_derivatives():

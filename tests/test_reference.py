@@ -33,7 +33,7 @@ def held_displacements(model: Rig, y0: Tensor) -> Tensor:
 
 def series(run: Trajectory) -> dict[str, Tensor]:
     """Every quantity of the reference over the run."""
-    out: dict[str, Tensor] = dict(run.channels)
+    out = dict(run.channels)
     for kind in ("energy", "dissipated", "supplied"):
         out |= {f"{kind}.{name}": value for name, value in getattr(run, kind).items()}
     out |= {

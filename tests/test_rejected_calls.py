@@ -46,7 +46,6 @@ from torchsoft.physics.validity import check_slip
 NAN = float("nan")
 T = times(4e-3, 3)
 REJECTIONS = ValueError, TypeError, IndexError, NotImplementedError, NoEquilibrium
-Call = Callable[[], object]
 
 # parts
 # ----------------------------------------------------------------------
@@ -110,7 +109,7 @@ def ran(**parts: Any) -> object:
 
 def small(**more: dict[str, Any]) -> Rig:
     """A disc on a pad on the ground, with more or other parts."""
-    parts: dict[str, Any] = {
+    parts = {
         "bodies": {"disc": Body(0.4, Circle(0.02))}, "pads": {"P": Pad(MESH, SOFT)},
         "contacts": {"c": Contact("P", "disc", LAW)}, "actuators": {},
     }  # fmt: skip
@@ -137,7 +136,7 @@ def rated(change: Callable[..., Tensor], mu: float | None = None) -> Callable[..
     return lambda E, F_N, R: (E - own * change(F_N)).clamp(min=0.0) / R
 
 
-PARTS: list[tuple[Call, str]] = [
+PARTS = [
     # shapes
     (lambda: resting(shape=Superellipse(20e-3, 6e-3, 4.0)), "differ by more than a factor of 3"),
     (lambda: Contour(FLAT), "turns by .* degrees"),
@@ -155,8 +154,6 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: FingertipMesh(8e-3, 10), "`elements_around` must be a multiple of 4, but is 10"),
     # materials; more in `test_material`
     (lambda: Prony(**RUBBER, moduli=[1e5], tau=[0.1, 1.0]), "as many `moduli` as .* 1 and 2"),
-    (lambda: resting(material=Prony(**RUBBER, moduli=[1e5], tau=[5e-5])),
-     "tau_instant = 0.0001 s must be below the shortest"),
     (lambda: resting(material=Stretched(**RUBBER, tau=0.01)), "1.2; divide both J and E by that"),
     (lambda: small(pads={"L": Pad(MESH, SERIES, inertial=True)}),
      "`L` needs a material of one retardation time, being inertial"),
@@ -241,7 +238,7 @@ def signal(change: Callable[[Tensor, Tensor], Tensor]) -> dict[str, Any]:
 
 
 FORWARD = {"gradient": "forward", "wrt": ["contact.K_x"]}
-RUNS: list[tuple[dict[str, Any], str]] = [
+RUNS = [
     ({"t": f64(0.0, 0.1, 0.1)}, r"increase strictly .* t\[1:3\]"),
     ({"t": f64(0.0, NAN)}, "finite"),
     ({"t": T.clone().requires_grad_()}, "`t` must not require a gradient"),
@@ -283,11 +280,11 @@ def test_odd_values_of_an_argument_of_a_run_are_rejected_with_its_name(name, sta
 
 
 @pytest.mark.parametrize("name", ["gradient", "wrt", "touch"])
-@pytest.mark.parametrize("odd", ["x", None, True, 3, NAN, np.zeros(3), f64(1, 2), [3], {}])
-def test_odd_names_of_a_run_are_rejected(name, odd, start):
-    given = {"gradient": "forward", "wrt": ["gravity"]} | {name: odd}
-    with pytest.raises(ValueError, match=f"`{name}` must be"):
-        simulate(start[0], T, y0=start[1], **given)
+def test_odd_names_of_a_run_are_rejected(name, start):
+    for odd in ("x", None, True, 3, NAN, np.zeros(3), f64(1, 2), [3], {}):
+        given = {"gradient": "forward", "wrt": ["gravity"]} | {name: odd}
+        with pytest.raises(ValueError, match=f"`{name}` must be"):
+            simulate(start[0], T, y0=start[1], **given)
 
 
 @pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap])
@@ -309,7 +306,7 @@ def grouped(model: Rig) -> None:
     model.groups, model.pad = ("pad",), KelvinVoigt(**RUBBER, tau=0.01)
 
 
-SPOILT: list[tuple[Callable[[Rig], object], str]] = [
+SPOILT = [
     (lambda m: m.parameter("pad.E").detach().fill_(0.0), r"`.*\.E` must be from 1 to .* but is 0"),
     (lambda m: m.parameter("pad.E").detach().fill_(1e308), r"`.*\.E` must be below 1e\+100"),
     (lambda m: m.parameter("contact.mu_k").detach().fill_(0.9), "mu_k = 0.9 > mu_s = 0.8"),

@@ -16,7 +16,6 @@ from torchsoft.datasets.config import Config as Dataset
 from torchsoft.quantity import quantities
 from torchsoft.rigs.goal import Goal
 from torchsoft.sysid.configuration import Config as Identification
-from torchsoft.tables import Table
 
 Wrap = Callable[[Any], Any]
 
@@ -88,7 +87,7 @@ def put(whole: Any, key: Any, wrap: Wrap, value: Any) -> Any:
 def outside(leaf: dict[str, Any]) -> list[Any]:
     """Numbers just outside the bounds of a schema."""
 
-    def by(x: Any) -> Any:
+    def by(x):
         return 1 if leaf["type"] == "integer" else 1e-9 * abs(x) or 1e-9
 
     out = [leaf[key] for key in ("exclusiveMinimum", "exclusiveMaximum") if key in leaf]
@@ -97,7 +96,7 @@ def outside(leaf: dict[str, Any]) -> list[Any]:
 
 
 RIG = ts.RigFile.ready("drop").model_dump(exclude_unset=True)
-FILES: dict[str, tuple[type[Table], Callable[[Any], object], dict[str, Any]]] = {
+FILES = {
     "rig": (ts.RigFile, ts.RigFile.from_tree, RIG),
     "goal": (Goal, Goal.model_validate, least(Goal.model_json_schema(), {})),
     "identification": (
@@ -153,13 +152,13 @@ ENERGY = {"tau": 0.01} | SERIES | {k: x for k, x in RUBBER.items() if k != "E"}
 SPRINGS = {"K_n": 1e5, "R_n": 4e2, "K_t": 1e5, "R_t": 4e2}
 TRIANGLE = [(-12e-3, -9e-3), (19e-3, -9e-3), (-12e-3, 18e-3)]
 
-USUAL: dict[str, Any] = {
+USUAL = {
     "shape": ts.Circle(0.02), "material": ts.KelvinVoigt(**RUBBER, tau=0.01),
     "mesh": ts.PadMesh(**BOX), "friction": ts.Coulomb(0.8, 0.7), "law": ts.PD(1.0, 1.0),
 }  # fmt: skip
 """The other parts of a rig, and arguments of parts."""
 
-PARTS: dict[str, dict[type, dict[str, Any]]] = {
+PARTS = {
     "shape": {
         ts.Circle: {"radius": 0.02},
         ts.Ellipse: {"a": 0.03, "b": 0.02},
@@ -224,7 +223,7 @@ PARTS: dict[str, dict[type, dict[str, Any]]] = {
 CALLED = {"moduli": "E", "times": "tau"}
 """Parameters that have another name than the argument."""
 
-ALLOWED: dict[Any, tuple[float, ...]] = {
+ALLOWED = {
     (ts.CurvedPadMesh, "radius"): (math.inf, -math.inf),  # flat
     (ts.RoundedPolygon, "radius"): (10.0 + 1e-8,),  # does not fit on the polygon
 }
@@ -275,7 +274,7 @@ def test_a_number_of_a_part_is_rejected_with_its_name(place, kind, name, declare
     given = PARTS[place][kind]
     ends = {"type": "number", "minimum": declared.low, "maximum": declared.high}
 
-    def call(value: Any) -> object:
+    def call(value):
         return used(place, kind, given | {name: changed(given[name], value)})
 
     values = [x for x in (*NO_NUMBERS, *outside(ends)) if x not in ALLOWED.get((kind, name), ())]

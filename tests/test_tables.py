@@ -1,12 +1,12 @@
 """Tables: refusals are one sentence that names the field, what was given and what is allowed; files
 of TOML are read alike."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pytest
 from pydantic import Field, model_validator
 
-from torchsoft.tables import LISTED, InvalidTable, Table, from_toml, shown
+from torchsoft.tables import LISTED, InvalidTable, Table, from_toml
 
 
 class Roll(Table):
@@ -36,7 +36,7 @@ class Run(Table):
         return self
 
 
-REJECTED: dict[str, tuple[Any, str]] = {
+REJECTED = {
     "unknown": ({"steps": 1.0}, "`steps` is not known here; did you mean `step`?"),
     "missing": ({"motions": [{"kind": "roll"}, {}]}, "motions.1.kind is missing"),
     "another kind": (
@@ -76,12 +76,6 @@ def test_what_is_right_is_taken_as_it_is():
 def test_a_table_stays_as_it_was_made():
     with pytest.raises(InvalidTable, match=r"^step cannot be set: a table stays as it was made"):
         Run().step = 2.0
-
-
-def test_values_are_shown_short():
-    assert len(shown("x" * 1000)) < 60
-    assert len(shown({str(i): ["y" * 100] * 100 for i in range(100)})) <= 120
-    assert "\n" not in shown("a\nb")
 
 
 def test_a_mark_of_order_and_other_ends_of_lines_are_read(tmp_path):

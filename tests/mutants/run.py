@@ -184,28 +184,21 @@ def summary(path: Path, before: Path | None) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    commands = parser.add_subparsers(required=True, dest="command")
-    for function in (cover, run):
-        one = commands.add_parser(function.__name__, description=function.__doc__)
-        one.add_argument("out", type=Path, help="folder for the copies, the coverage and the logs")
-    commands.choices["cover"].add_argument("-n", type=int, default=2, help="processes")
-    commands.choices["run"].add_argument("to", type=Path, help="file of the results, JSON lines")
-    commands.choices["run"].add_argument("--only", nargs="*", default=[], help="names of mutants")
+    parser.add_argument("command", choices=["cover", "run", "summary"])
+    parser.add_argument("paths", type=Path, nargs="+", help="OUT; OUT and TO; or results [before]")
+    parser.add_argument("-n", type=int, default=2, help="processes of `cover`")
+    parser.add_argument("--only", nargs="*", default=[], help="names of mutants")
     limit = "most processor time for the tests of one mutant [s]"
-    commands.choices["run"].add_argument("--seconds", type=int, default=180, help=limit)
-    one = commands.add_parser("summary", description=summary.__doc__)
-    one.add_argument("results", type=Path)
-    one.add_argument("before", type=Path, nargs="?", help="results to compare with")
+    parser.add_argument("--seconds", type=int, default=180, help=limit)
     given = parser.parse_args()
+    first, second = (*given.paths, None)[:2]
     if given.command == "summary":
-        summary(given.results, given.before)
-        return
-    out = given.out.resolve()
+        return summary(first, second)
+    out = first.resolve()
     out.mkdir(parents=True, exist_ok=True)
     if given.command == "cover":
-        cover(out, given.n)
-    else:
-        run(out, given.to, given.only, given.seconds)
+        return cover(out, given.n)
+    return run(out, second, given.only, given.seconds)
 
 
 if __name__ == "__main__":
