@@ -21,7 +21,6 @@ FIRM = {"kind": "kelvin_voigt", "E": 0.75e6, "nu": 0.45, "tau": 10e-3, "depth": 
 GEL = FIRM | {"E": 0.15e6, "tau": 3e-3}
 TALL = {"kind": "rounded_box", "half_width": 10e-3, "half_height": 20e-3, "radius": 3e-3}
 BALL = {"kind": "circle", "radius": 5e-3}
-AUTO = dict.fromkeys(("K_n", "R_n", "K_t", "R_t"), "auto")
 SPRINGS = {"K_n": 1.2e5, "R_n": 400.0, "K_t": 1.2e5, "R_t": 400.0}
 DRY = {**SPRINGS, "friction": {"kind": "smooth", "mu_s": 0.8, "mu_k": 0.7, "v_s": 0.05}}
 
@@ -66,22 +65,6 @@ def on_one_pad(
     return RigFile.from_tree(tree | {"actuators": loops, "motion": motion} | others)
 
 
-def inclined() -> RigFile:
-    """A block on a pad of a table that is inclined until it slides off, at 21.8 degrees."""
-    box = {"kind": "rounded_box", "half_width": 20e-3, "half_height": 5e-3, "radius": 4e-3}
-    pad = {
-        "material": "rubber", "base": "table", "length": 120e-3, "height": 6e-3, "elements_x": 60,
-        "elements_y": 2, "origin": (-60e-3, 0.0),
-    }  # fmt: skip
-    block = {"mass": 0.3, "shape": box, "start": REST}
-    friction = {"kind": "coulomb", "mu_s": 0.4, "mu_k": 0.4}
-    return on_one_pad(
-        {}, bodies={"disc": block, "table": {"x": 0.0, "y": 0.0, "theta": "driven"}},
-        pads={"ground": pad}, laws={"dry": {**AUTO, "friction": friction}},
-        motion={"table.theta": ramp(0.2, 4.2, 0.0, 0.5)}, outputs={"duration": 5.0},
-    )  # fmt: skip
-
-
 REST, HIGH = {"x": 0.0, "y": "rest"}, {"x": 0.0, "y": 60e-3}
 FLAT = {"theta": 0.0}
 
@@ -104,7 +87,8 @@ ALONE = {
                "warning: pads.ground: .*friction shears it by "),
     "out of reach": (on_one_pad({"x": 0.0, "y": 0.525}),
                      "error: bodies.disc: .*at t = 0.* it left the space over the pad `ground`"),
-    "inclined": (inclined(), "warning: bodies.disc: .*at t = 3.* reached the end of the pad"),
+    "dragged off": (on_one_pad(REST, press=10.0, far=100e-3, disc=FLAT),
+                    "warning: bodies.disc: .*at t = 0.42.* reached the end of the pad"),
 }  # fmt: skip
 
 
