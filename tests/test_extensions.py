@@ -9,7 +9,6 @@ from conftest import COARSE, paper, rest, still, times
 
 from torchsoft import simulate
 from torchsoft.physics.extensions import extend, extensions
-from torchsoft.rigs.build import RigFile
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
 
 MODEL = still(COARSE)
@@ -57,14 +56,6 @@ def test_loops_lag_together_or_alone(name, late):
     lag = model.parameter(name)
     assert {k for k, one in model.actuators.items() if getattr(one.law, "lag", 0) is lag} == {*late}
     assert model.parameter("actuators.y.Kp") is model.actuators["y"].law.law.Kp
-
-
-def test_names_are_those_of_a_rig_file():
-    rig = RigFile.ready("two_fingers").assemble()
-    names = [name for name in extensions(rig) if name.endswith(".power")]
-    assert all(name.startswith("laws.") for name in names)
-    extend(rig, names)
-    assert [rig.parameter(name).item() for name in names] == [1.0] * len(names)
 
 
 def test_an_extension_may_be_unknown():

@@ -176,13 +176,11 @@ WIDE = {"measures": ["bracket.x", "bracket.y", "disc.theta"], "pushes": ["bracke
     ("file", "name", "unit"),
     [
         *((PAPER, name, unit) for name, unit in {
-            "pad.E": "Pa", "contact.mu_s": "1", "gravity": "m/s2", "actuators.x.Kp": "N/m",
-            "control.R_99": "N.s/m", "motion.F_ff.values": "N", "motion.x_d.values_2": "m",
-            "motion.x_d.times": "s", "pad.elements_x": "1", "bodies.bracket.theta": "rad",
+            "pad.E": "Pa", "contact.mu_s": "1", "gravity": "m/s2", "control.R_99": "N.s/m",
+            "motion.F_ff.values": "N", "motion.x_d.values_2": "m", "motion.x_d.times": "s",
         }.items()),
         *((RigFile.ready("two_fingers"), name, unit) for name, unit in {
-            "actuators.left_turn.Kp": "N.m/rad", "actuators.left_turn.Kd": "N.m.s/rad",
-            "motion.lean.values": "rad",
+            "actuators.left_turn.Kd": "N.m.s/rad", "motion.lean.values": "rad",
         }.items()),
         (RigFile.ready("orientation"), "actuators.turn_lower.Kp", "N/rad"),
         *((controlled(**WIDE), f"controllers.jaw.{name}", unit) for name, unit in {

@@ -293,13 +293,6 @@ def test_a_contour_made_sharp_afterwards_is_rejected():
         rest(still(COARSE, shape=shape))
 
 
-def test_a_centre_of_mass_off_the_given_origin_is_logged(caplog):
-    RoundedPolygon(box(20e-3, 9e-3), 2e-3)
-    assert caplog.text == ""
-    RoundedPolygon(np.array(box(20e-3, 9e-3)) + [0.5, 0.25], 2e-3)
-    assert "the centre of mass is at (0.5, 0.25) m of `vertices`" in caplog.text
-
-
 def test_a_body_held_upright_although_its_pad_would_turn_it_is_warned_about():
     tilted = {"pads.ground.angle": 0.2, "bodies.ellipse.start": {"x": 0.06, "y": "rest"}}
     with pytest.warns(UserWarning, match="`ellipse` is held at theta = 0, where the pads turn it"):

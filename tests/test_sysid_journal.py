@@ -14,7 +14,7 @@ from hostile.damage import BYTES, PLANTED, Trap, Victim, archive, damage, forged
 
 from torchsoft.sysid import runs
 from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction
-from torchsoft.sysid.runs import CHECKPOINT, Job, Journal, Runner, decoded, encoded, forget
+from torchsoft.sysid.runs import CHECKPOINT, Job, Journal, Runner, forget
 
 ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
 PREDICTION = Prediction(
@@ -89,12 +89,6 @@ def test_a_damaged_or_planted_file_is_noticed_and_never_executed(tmp_path, kind)
     assert not trap.path.exists()
     again.keep(RUN, PREDICTION)
     assert same(journal(folder).recall(RUN), PREDICTION)
-
-
-def test_an_archive_is_no_pickle():
-    content = encoded(FailedRun(np.array([{}], dtype=object), 0.0))
-    with pytest.raises(ValueError, match="allow_pickle"):
-        decoded(content)
 
 
 def test_other_files_are_neither_joined_nor_removed(tmp_path):
