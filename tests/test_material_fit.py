@@ -164,6 +164,14 @@ def test_a_term_that_the_rows_do_not_determine_is_left_out():
     assert f"but {found.terms} are taken: the rows do not determine E_1" in found.notices[-1]
 
 
+def test_a_compliance_over_decades_counts_row_by_row():
+    """A power law over twelve decades of time: the series is as good at the first row."""
+    t = np.geomspace(1e-8, 1e4, 61)
+    found = fit(of(1e-6 * t**0.4, np.ones_like(t), t, "creep", per_load=True))
+    assert "of each row" in found.described
+    assert np.abs(found.residual / found.measured.answer).max() < 0.2
+
+
 @pytest.mark.parametrize(
     ("stress", "terms", "words"),
     [
@@ -263,6 +271,12 @@ def test_energies_are_found_again_from_three_kinds_of_tests(kind, tmp_path):
         assert nominal_stress(made, test, x) == pytest.approx(expected, rel=1e-5, abs=10)
 
 
+def test_an_exponent_may_pass_zero(tmp_path):
+    """In the search for the one term of a material that has two of opposite signs."""
+    found = fit_energy(pulls(tmp_path, TRUE["ogden"], "tension", "shear"), "ogden", nu=0.49)
+    assert found.rms < 0.02
+
+
 def test_noise_shows_in_the_standard_deviation(tmp_path):
     found = fit_energy(
         pulls(tmp_path, TRUE["neo_hookean"], "tension", noise=0.02), "neo_hookean", nu=0.49
@@ -292,6 +306,26 @@ def test_unphysical_energies_are_rejected(tmp_path):
     soft = fit_energy(made(1e-3 * x), "neo_hookean", nu=0.49)
     with pytest.raises(ValueError, match=r"parameter `E` must be from 1 to .* but is 0\.00"):
         write(soft, tmp_path, SOFT, {})
+
+
+STIFFENING = np.fromstring(
+    "0 0.25739 0.420847 0.518429 0.609233 0.659472 0.725627 0.756164 0.812768 0.834691 0.889458 "
+    "0.909682 0.968974 0.993877 1.064964 1.101971 1.194328 1.252889 1.379243 1.471617 1.648954 "
+    "1.790940 2.041571",
+    sep=" ",
+)
+"""Stress [MPa] at stretches from 1 to 7.38, which stiffens as natural rubber does."""
+
+
+@pytest.mark.parametrize(
+    ("terms", "rms"), [(2, 0.00515), pytest.param(3, 0.00509, marks=pytest.mark.slow)]
+)
+def test_ogdens_exponents_are_bounded_so_that_no_power_overflows(terms, rms, tmp_path):
+    x = np.linspace(0, 6.38, len(STIFFENING))
+    made = Pull(tmp_path / "p.csv", "tension", x, 1e6 * STIFFENING, (0.0, 6.38), ())
+    found = fit_energy([made], "ogden", nu=0.49, terms=terms)
+    assert found.rms < rms
+    assert any("at the limit of exponents" in one for one in found.notices) == (terms == 3)
 
 
 def test_what_one_test_does_not_tell_is_reported(tmp_path):
