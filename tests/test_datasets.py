@@ -1,5 +1,6 @@
 """What a dataset holds, and that it is the same whatever makes it and whatever interrupts that."""
 
+import errno
 import os
 import re
 import shutil
@@ -28,7 +29,7 @@ from torchsoft.datasets import open_dataset
 from torchsoft.datasets.card import card
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.files import Manifest, StoreError, listed
+from torchsoft.datasets.files import Manifest, StoreError, listed, store_errors
 from torchsoft.datasets.generate import (
     Part,
     Serial,
@@ -459,6 +460,14 @@ def test_folders_that_hold_something_else_are_rejected(made, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
     with pytest.raises(StoreError, match="holds another dataset"):
         open_or_create(str(made[0]), made[1].model_copy(update={"seed": 99}))
+
+
+@pytest.mark.parametrize(
+    ("number", "words"), [(errno.EFBIG, "outgrew the limit on file sizes"), (errno.ENOSPC, "full")]
+)
+def test_errors_of_the_disk_have_remedies(number, words):
+    with pytest.raises(StoreError, match=f"^a set: .*{words}"), store_errors("a set"):
+        raise OSError(number, "no")
 
 
 def test_parts_share_every_shard_out_once(made):
