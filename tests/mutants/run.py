@@ -198,6 +198,8 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     if given.command == "cover":
         return cover(out, given.n)
+    if second is None:
+        parser.error("run needs two paths, OUT and TO")
     return run(out, second, given.only, given.seconds)
 
 
