@@ -145,6 +145,15 @@ def contact_theory(found):
 
 
 @claims
+def peers(found):
+    """Positions after a slide are theory's, and their derivatives but for the ripple of nodes."""
+    row = found["errors"]["torchsoft " + found["versions"]["torchsoft"] + ", default"]
+    assert max(abs(row[f"{body}: x"]) for body in ("block", "rolls")) < 2e-3
+    assert max(abs(row[f"block: {name}"]) for name in ("dx/dmu", "dx/dv")) < 5e-3
+    assert abs(row["rolls: dx/dmu"]) < 0.05
+
+
+@claims
 def gradient_accuracy(found):
     """The windows are what they are called, and errors are 1e-6 where the judge is that good."""
     slip, stick, grasp = (found["windows"][name] for name in ("slip", "stick", "grasp"))
