@@ -147,10 +147,13 @@ def contact_theory(found):
 @claims
 def peers(found):
     """Positions after a slide are theory's, and their derivatives but for the ripple of nodes."""
-    row = found["errors"]["torchsoft " + found["versions"]["torchsoft"] + ", default"]
-    assert max(abs(row[f"{body}: x"]) for body in ("block", "rolls")) < 2e-3
-    assert max(abs(row[f"block: {name}"]) for name in ("dx/dmu", "dx/dv")) < 5e-3
-    assert abs(row["rolls: dx/dmu"]) < 0.05
+    table = found["tables"]["torchsoft"]
+    off = {
+        name: float(cell.rstrip("%")) for name, cell in zip(table["head"][1:], table["rows"][0][1:])
+    }
+    assert max(abs(off[name]) for name in ("block: x", "rolls: x")) < 0.2
+    assert max(abs(off[name]) for name in ("block: dx/dmu", "block: dx/dv")) < 0.5
+    assert abs(off["rolls: dx/dmu"]) < 5
 
 
 @claims
