@@ -224,8 +224,9 @@ def recordings(result: IdentificationResult) -> list[list[str]]:
 def residuals(result: IdentificationResult) -> list[list[str]]:
     """Rows on the residuals of what was fitted, with the order and the standard deviation of the
     noise."""
-    known = {one.channel: one.model for one in result.noise}
-    noise = {name: f"order {one.order}, {one.sd:.2g} × as stated" for name, one in known.items()}
+    noise = {
+        name: f"order {one.order}, {one.sd:.2g} × as stated" for name, one in result.noise.items()
+    }
     out = []
     for one in result.residuals:
         row = [one.recording, one.channel, f"{one.rms:.2f}", grouped(one.lag1, 2)]
