@@ -97,6 +97,18 @@ def contact_theory(found):
     assert abs(roll["off"]) < 5e-3
 
 
+@claims
+def peers(found):
+    """Positions after a slide are theory's, and their derivatives but for the ripple of nodes."""
+    table = found["tables"]["torchsoft"]
+    off = {
+        name: float(cell.rstrip("%")) for name, cell in zip(table["head"][1:], table["rows"][0][1:])
+    }
+    assert max(abs(off[name]) for name in ("block: x", "rolls: x")) < 0.2
+    assert max(abs(off[name]) for name in ("block: dx/dmu", "block: dx/dv")) < 0.5
+    assert abs(off["rolls: dx/dmu"]) < 5
+
+
 @pytest.mark.slow
 def test_the_inertia_of_pads_changes_nothing_that_can_be_measured():
     """Nanometres of the disc and millinewtons of the force, in a grasp on a coarse mesh."""

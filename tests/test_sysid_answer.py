@@ -421,7 +421,7 @@ def test_warnings_come_first_then_parameters_starts_and_sensors(page, full):
 
 
 def test_assumptions_that_matter_stand_open_and_others_are_folded(page):
-    folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
+    folded = page.text.index("\n1 that shift no estimate by more than 0.5 standard deviations\n")
     assert (
         page.text.index(f"\n−4.2 sd of {E}\n−3.1 ± 1.2 %\nsuspected: lowers the sum of ") < folded
     )
