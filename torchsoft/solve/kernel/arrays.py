@@ -479,23 +479,6 @@ class Run(NamedTuple):
 
 
 @table
-class Rates(NamedTuple):
-    """Arguments of `rates`."""
-
-    rig: Annotated[Any, System]
-    work: Annotated[Any, Work]
-    followed: Signals
-    limits: Limits
-    t: float
-    y: Array
-    signals: Cube
-    powers: Array
-    wrenches: Matrix
-    out: Array
-    converged: Index
-
-
-@table
 class Backward(NamedTuple):
     """Arguments of `backward`."""
 
