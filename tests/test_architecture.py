@@ -26,7 +26,7 @@ FLOWS = {
         names motion validity graph structure energy statics start channels namespace rig
         extensions setup .
     """,
-    "physics.mesh": "mesh block files quads .",
+    "physics.mesh": "element mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",
     "solve": """
         kernel laws steps progress model parameters stepper gradients trajectory netcdf vtk mcap

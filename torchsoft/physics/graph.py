@@ -24,7 +24,7 @@ from torchsoft.physics.contact import (
     relative_motion,
     turned,
 )
-from torchsoft.physics.elements import Quadrilateral
+from torchsoft.physics.mesh.element import QUADRILATERAL
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import check_names
@@ -518,7 +518,7 @@ class Graph(nn.Module):
         under the forces of a law of contact points, or of a branch. No dashpot is between two of
         them."""
         pad, part = self.pads[name], state.pads[name]
-        at, dofs = pad.at_corners(part), Quadrilateral.dofs
+        at, dofs = pad.at_corners(part), QUADRILATERAL.dofs
         own = slice(dofs * field, dofs * (field + 1))
         others = own.start, at.shape[-1] - own.stop
         internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., own]

@@ -27,9 +27,10 @@ from torchsoft.physics.contact import (
     slip_of,
     stored_law,
 )
-from torchsoft.physics.elements import Quadrilateral, element_potentials
+from torchsoft.physics.elements import element_potentials
 from torchsoft.physics.hyperelastic import Hyperelastic, invariants
 from torchsoft.physics.material import Material
+from torchsoft.physics.mesh.element import QUADRILATERAL
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.shapes import Shape
@@ -404,10 +405,10 @@ def element_law(
     own = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
     parameters: dict[str, Tensor] = {f"material.{key}": value for key, value in own.items()}
     parameters["factors.values"] = factors
-    corners = Quadrilateral.dofs * fields
+    corners = QUADRILATERAL.dofs * fields
     try:
         law = compiled_law(
-            parameters, element, 2 * corners + Quadrilateral.constants, corners, 2 * corners,
+            parameters, element, 2 * corners + QUADRILATERAL.constants, corners, 2 * corners,
             conjugates=corners, lanes=LANES, material=material, factors=Factors(factors),
         )  # fmt: skip
     except UnknownOperation as error:

@@ -18,10 +18,10 @@ from torchsoft.caller import warn
 from torchsoft.codegen import Law
 from torchsoft.physics.channels import recorded_slices
 from torchsoft.physics.contact import SoftContact
-from torchsoft.physics.elements import Quadrilateral
 from torchsoft.physics.energy import integrals
 from torchsoft.physics.hyperelastic import Hyperelastic
 from torchsoft.physics.material import Material
+from torchsoft.physics.mesh.element import QUADRILATERAL
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -41,6 +41,7 @@ from torchsoft.solve.kernel.arrays import (
     CONDENSED,
     LANES,
     NODAL,
+    SIDE,
     Backs,
     Bodies,
     Condensed,
@@ -374,13 +375,13 @@ class Model:
             pull=address("pull"),
             p_first=starts, p_last=ends,
             X=joined(lambda pad: np.tile(pad.positions.numpy(), pad.fields).ravel()),
-            area=joined(lambda pad: np.repeat(pad.mesh.nodal_areas, 2 * pad.fields)),
-            dof=np.concatenate([np.zeros((0, Quadrilateral.dofs * fields)), *(
-                filled_up(lengthened(dof, -1), Quadrilateral.dofs * fields) for dof in numbers
+            area=joined(lambda pad: np.repeat(pad.mesh.areas[pad.mesh.free], 2 * pad.fields)),
+            dof=np.concatenate([np.zeros((0, QUADRILATERAL.dofs * fields)), *(
+                filled_up(lengthened(dof, -1), QUADRILATERAL.dofs * fields) for dof in numbers
                 if dof is not None
             )]),
-            constants=joined(lambda pad: lengthened(pad.constants, 0.0), Quadrilateral.constants),
-            surface=np.concatenate([np.zeros(0), *surface]), field=Quadrilateral.dofs,
+            constants=joined(lambda pad: lengthened(pad.constants, 0.0), QUADRILATERAL.constants),
+            surface=np.concatenate([np.zeros(0), *surface]), field=QUADRILATERAL.dofs,
         )  # fmt: skip
 
     def _make_sources(self) -> Sources:
@@ -480,9 +481,10 @@ class Model:
             X=joined((pad.point_positions for pad in pads), 2),
             weight=joined(rig.weight(name).detach() for name in rig.contacts),
             node=joined(
-                (self._pads.node_start[k] + pad.point_nodes for k, pad in zip(owners, pads)), 2
+                (self._pads.node_start[k] + pad.point_nodes for k, pad in zip(owners, pads)),
+                SIDE,
             ),
-            N=joined((pad.point_shares for pad in pads), 2), y_start=joined(
+            N=joined((pad.point_shares for pad in pads), SIDE), y_start=joined(
                 np.arange(*self.layout.slices["stretch", name].indices(self.layout.size))
                 for name in rig.contacts
             ),
