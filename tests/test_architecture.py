@@ -29,8 +29,8 @@ FLOWS = {
     "physics.mesh": "element mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",
     "solve": """
-        kernel laws steps progress model parameters stepper gradients trajectory netcdf vtk mcap
-        diagnostics simulate batch torchdiffeq .
+        kernel laws steps progress rig_arrays model parameters stepper gradients trajectory
+        netcdf vtk mcap diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
         sentences

@@ -19,7 +19,8 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.structure import Structure, copied, described
 from torchsoft.physics.validity import check_place, check_values, ordinary
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.model import computed, model_of, prepared_laws, prepared_shapes
+from torchsoft.solve.model import model_of
+from torchsoft.solve.rig_arrays import computed, prepared
 from torchsoft.solve.steps import Followed, own_units
 
 
@@ -84,7 +85,7 @@ class Parameters:
                 return
         if not model.within(modules, values):
             check_values(self.rig)
-        made = computed(self.rig, prepared_shapes(self.rig), prepared_laws(self.rig)).values()
+        made = computed(self.rig, *prepared(self.rig)).values()
         self.vector = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
         self.p, self.units = self.vector[model.index], own_units(self.rig, model.smallest)
         self.numbers = self.p.detach().numpy()
