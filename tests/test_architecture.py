@@ -24,7 +24,7 @@ FLOWS = {
         arguments mesh shapes state contact rate_and_state ageing material hyperelastic elements
         pads matched balance multibond parts
         names motion validity graph structure energy statics start channels namespace rig
-        extensions setup .
+        setup .
     """,
     "physics.mesh": "element mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",
@@ -33,7 +33,7 @@ FLOWS = {
         netcdf vtk mcap diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
-        sentences
+        sentences extensions
         initial_state recording unknowns noise prediction runs alternatives assumptions problem
         first_samples
         synthetic fit plan prechecks

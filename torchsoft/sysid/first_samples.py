@@ -17,12 +17,12 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.channels import measurable
 from torchsoft.physics.contact import cross, point_place, slip_of
-from torchsoft.physics.extensions import undelayed
 from torchsoft.physics.parts import COORDINATES, PD, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import above
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, resting, settled
+from torchsoft.sysid.extensions import undelayed
 from torchsoft.sysid.initial_state import (
     LEAD,
     PREFIX,
