@@ -175,7 +175,7 @@ def test_contact_points_stand_for_the_whole_face(mesh, points):
     beside = 0.5 * (every[-1] - every[0] - s[-1] + s[0])  # half of the sides to a held node
     lengths = pad.point_lengths
     assert lengths.sum() == pytest.approx(s[-1] - s[0] + beside * (points == 0), rel=1e-12)
-    assert pad.spread.sum(1).numpy() == pytest.approx(np.ones(len(lengths)), abs=1e-15)
+    assert pad.interpolation.sum(1).numpy() == pytest.approx(np.ones(len(lengths)), abs=1e-15)
     assert len(lengths) == (len(s) if points == 0 else points * (len(s) - 1))
     if points == 3:
         integral = (lengths * pad.point_coordinates**4).sum()

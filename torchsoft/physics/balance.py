@@ -226,7 +226,11 @@ class Nodes:
         """Contact less internal forces (..., nodes, 2) [N]."""
         pad = self.pad
         left = -pad.from_corners(self.internal(pad.at_corners(x)))
-        return left if self.law is None else left + pad.spread.mT @ self.law(pad.spread @ x)
+        return (
+            left
+            if self.law is None
+            else left + pad.interpolation.mT @ self.law(pad.interpolation @ x)
+        )
 
     def linearised(self, x: Tensor) -> Solve:
         """By factors of the derivative of internal less contact forces, sample by sample."""
@@ -238,9 +242,9 @@ class Nodes:
             (rows,) = torch.autograd.grad(each.sum(), at)
         elements = rows.movedim(0, -2)
         elements = elements.reshape(-1, *elements.shape[-3:])
-        contacts = torch.zeros(len(elements), len(pad.spread), 2, 2, dtype=x.dtype)
+        contacts = torch.zeros(len(elements), len(pad.interpolation), 2, 2, dtype=x.dtype)
         if self.law is not None:
-            contacts = slopes_at_points(self.law, pad.spread @ x).reshape(contacts.shape)
+            contacts = slopes_at_points(self.law, pad.interpolation @ x).reshape(contacts.shape)
         pairs = zip(elements.numpy(), contacts.numpy())
         return self.by_factors([self.banded.factor(*pair) for pair in pairs])
 

@@ -112,8 +112,8 @@ class Pad(nn.Module):
         own = mesh.surface if self.nodal else np.arange(len(kept))
         self.register_buffer("surface", torch.from_numpy(own.copy()), persistent=False)
         self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
-        spread = shape_functions(own[self.point_nodes], self.point_shares, len(kept))
-        self.register_buffer("spread", torch.from_numpy(spread), persistent=False)
+        interpolation = shape_functions(own[self.point_nodes], self.point_shares, len(kept))
+        self.register_buffer("interpolation", torch.from_numpy(interpolation), persistent=False)
 
     def remeshed(self, finer: int, points: int) -> "Pad":
         """The same pad of `finer` times as many elements each way, with so many contact points an
@@ -186,12 +186,12 @@ class Pad(nn.Module):
         """Kelvin elements of the chain."""
         return self.material.branches + len(self.material.added)
 
-    spread: Tensor
+    interpolation: Tensor
     """Shape functions of the nodes in the state at the contact points (points, nodes)."""
 
     def at_points(self, x: Tensor) -> Tensor:
         """Nodal vectors (..., nodes, 2) at the contact points (..., points, 2)."""
-        return x[..., self.surface, :] if self.points == 0 else self.spread @ x
+        return x[..., self.surface, :] if self.points == 0 else self.interpolation @ x
 
     @property
     def nodes(self) -> int:
@@ -229,7 +229,7 @@ class Pad(nn.Module):
     @property
     def point_positions(self) -> Tensor:
         """Undeformed places of the contact points in the base's frame (points, 2) [m]."""
-        return self.spread @ self.positions
+        return self.interpolation @ self.positions
 
     @property
     def point_coordinates(self) -> Array:
@@ -271,7 +271,7 @@ class Pad(nn.Module):
                 "take a massless pad of a linear material"
             )
 
-    def elements(self, name: str) -> tuple[str, ...]:
+    def bond_elements(self, name: str) -> tuple[str, ...]:
         """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
         elements of its chain, or of its strain energy W."""
         if isinstance(self.material, Hyperelastic):
@@ -327,19 +327,19 @@ class Pad(nn.Module):
     def element_forces(self, u: Tensor, rate: Tensor | None = None) -> Tensor:
         """Forces (..., elements, 8 fields) [N] on the corners of a nodal pad's elements, by default
         at rest."""
-        u, still = torch.broadcast_tensors(u, torch.zeros_like(u) if rate is None else rate)
+        u, velocity = torch.broadcast_tensors(u, torch.zeros_like(u) if rate is None else rate)
         recorded = torch.is_grad_enabled()
         with torch.enable_grad():
             if not (recorded and u.requires_grad):
                 u = u.detach().requires_grad_()
-            if not (recorded and still.requires_grad):
-                still = still.detach().requires_grad_()
-            given = self.element_inputs(u, still)
+            if not (recorded and velocity.requires_grad):
+                velocity = velocity.detach().requires_grad_()
+            given = self.element_inputs(u, velocity)
             energy = element_energy(*given).sum()
             (force,) = torch.autograd.grad(energy, u, create_graph=recorded, retain_graph=True)
             if rate is not None:
                 potential = element_potential(*given).sum()
-                (viscous,) = torch.autograd.grad(potential, still, create_graph=recorded)
+                (viscous,) = torch.autograd.grad(potential, velocity, create_graph=recorded)
                 force = force + viscous
         return force
 
@@ -427,7 +427,7 @@ class Pad(nn.Module):
     def surface_points(self, u: Array) -> Array:
         """Places (..., points, 2) [m] of the contact points in the frame of the base, of
         displacements u (..., nodes, 2) [m] as a run records them."""
-        return (self.spread @ (self.positions + torch.from_numpy(u))).numpy()
+        return (self.interpolation @ (self.positions + torch.from_numpy(u))).numpy()
 
     def gradient(self, displacement: Array) -> Array:
         """F (..., elements, 2, 2) at the centres of the elements, of displacements of all nodes."""

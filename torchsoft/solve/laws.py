@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchsoft.codegen import Law, UnknownOperation, compile_law
 from torchsoft.codegen.emit import check_pointwise
-from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.graph import ScalarGraph
 from torchsoft.codegen.stops import left_out
 from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import (
@@ -111,7 +111,7 @@ def compiled_law(
         example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
 
         def expressions() -> tuple[Any, ...]:
-            graph = Graph()
+            graph = ScalarGraph()
             outputs = traced(graph, law, example, names)
             return (
                 tuple(graph.ops),

@@ -52,9 +52,9 @@ from torchsoft.solve.rig_arrays import (
     Laws,
     arrays_of,
     computed,
-    followed,
     prepared,
     read_together,
+    signal_count,
 )
 from torchsoft.solve.steps import CHUNK, ErrorParts, Followed
 
@@ -90,7 +90,7 @@ class Model:
     layout: places of the parts of the state (size,)
     recorded: places in the forces (recorded,) of an output, by kind and name
     integrals: energies [J] that are integrated beside the state
-    signals, followed: names of the reference's signals; their number with fixed coordinates
+    signals, signal_count: names of the reference's signals; their number with fixed coordinates
     places: places in the vector of parameters, by their names
     index (m,): places in that vector of the numbers p that the kernels read
     low, high (parameters,): least and largest values of the parameters, each in its unit
@@ -124,7 +124,7 @@ class Model:
         self.shared = structure.known and not laws.custom
         self.layout, self.integrals = rig.layout, integrals(rig)
         self.recorded, self.errors = recorded_slices(rig), ErrorParts(rig)
-        self.signals, self.followed = rig.signals, followed(rig)
+        self.signals, self.signal_count = rig.signals, signal_count(rig)
         count, firsts = 0, dict[int, int]()
         for value in (*values, *made.values()):
             firsts.setdefault(id(value), count)
@@ -183,7 +183,7 @@ class Model:
         try:
             found = self._idle.pop()
         except IndexError:
-            return Room(self.system(p.copy()), *self.widths[:2], self.followed)
+            return Room(self.system(p.copy()), *self.widths[:2], self.signal_count)
         found.system.p[:] = p
         return found
 

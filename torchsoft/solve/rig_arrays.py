@@ -140,7 +140,7 @@ def joined(parts: Any, *shape: int) -> Any:
     return np.concatenate([np.zeros((0, *shape)), *parts])
 
 
-def followed(rig: Rig) -> int:
+def signal_count(rig: Rig) -> int:
     """Number of the reference's signals and fixed coordinates."""
     return len(rig.signals) + len(rig.fixed_values)
 
@@ -170,7 +170,7 @@ def port_arrays(rig: Rig, bodies: Bodies) -> Ports:
         i for (of, _), s in rig.layout.slices.items() if of == "control"
         for i in range(s.start, s.stop)
     ]  # fmt: skip
-    none, signals = np.full_like(free, -1), np.arange(2 * followed(rig))
+    none, signals = np.full_like(free, -1), np.arange(2 * signal_count(rig))
     follows = [np.where(signal < 0, -1, 2 * signal + k) for k in (0, 1)]
     join = lambda *parts: np.concatenate([np.full(len(signals), -1), *parts])
     after = np.full(len(states), -1)
@@ -269,7 +269,7 @@ def nodal_arrays(rig: Rig, at: At, laws: Laws) -> Nodal:
 def source_arrays(rig: Rig, at: At, laws: Sequence[Law]) -> Sources:
     """Actuators, and weights of the bodies that move along y."""
     every, others = rig.actuators.values(), [[]] * len(rig.weighted)
-    first, count = 2 * followed(rig), 3 * len(rig.bodies) + 3
+    first, count = 2 * signal_count(rig), 3 * len(rig.bodies) + 3
     inputs, states = [], first + 2 * count
     for one in every:
         read = [2 * rig.signals.index(name) + k for name in one.reads for k in (0, 1)]

@@ -284,7 +284,7 @@ def stretches(rig: Rig, bodies: Mapping[str, Normal], at: float, time: float) ->
     for name, F_N in loads(rig, state).items():
         contact, weight = rig.contacts[name], rig.weight(name)
         pad = rig.pads[contact.pad]
-        loaded = np.flatnonzero((pad.spread[F_N > 0] != 0).any(0).numpy())
+        loaded = np.flatnonzero((pad.interpolation[F_N > 0] != 0).any(0).numpy())
         if not len(loaded):
             continue
         places = np.sort(along(pad, pad.positions[pad.surface]))
