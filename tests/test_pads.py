@@ -24,6 +24,9 @@ from skfem import (
 )
 
 from torchsoft import (
+    Body,
+    Circle,
+    Contact,
     CurvedPadMesh,
     FingertipMesh,
     GeneralisedKelvin,
@@ -33,8 +36,12 @@ from torchsoft import (
     PadMesh,
     Prony,
     QuadMesh,
+    Rig,
+    SmoothSlip,
+    SoftContact,
     StandardLinearSolid,
     Taxels,
+    simulate,
 )
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 from torchsoft.physics.mesh.element import Element
@@ -260,6 +267,13 @@ def test_a_linear_pad_has_quadratic_elements(points):
     if points:
         integral = (pad.point_lengths * place[:, 0] ** 4).sum()
         assert integral == pytest.approx(20e-3**5 / 5, rel=1e-12)
+    law = SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.5, 0.4, 5e-2))
+    contacts = {"P": Contact("P", "disc", law)}
+    rig = Rig(bodies={"disc": Body(0.4, Circle(0.02))}, pads={"P": pad}, contacts=contacts)
+    state = rig.unpack(rig.state(disc={"x": 0.01, "y": "rest"}).detach())
+    assert float(state.pads["P"][..., 1].sum()) == pytest.approx(-0.4 * 9.81, rel=1e-9)
+    with pytest.raises(NotImplementedError, match=r"`P` has 3 nodes on a side, .* compiled for 2"):
+        simulate(rig, [0.0, 0.01], y0=rig.pack(state))
     with pytest.raises(NotImplementedError, match="bilinear quadrilaterals"):
         Pad(mesh, rubber(), inertial=True)
 

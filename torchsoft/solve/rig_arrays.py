@@ -183,6 +183,12 @@ def port_arrays(rig: Rig, bodies: Bodies) -> Ports:
 
 def pad_arrays(rig: Rig, coordinate: Index) -> Pads:
     """`coordinate` (free,) are the coordinates that are free."""
+    for name, pad in rig.pads.items():
+        if pad.mesh.element.side != SIDE:
+            raise NotImplementedError(
+                f"an element of the pad `{name}` has {pad.mesh.element.side} nodes on a side, but "
+                f"the kernels are compiled for {SIDE}; set `SIDE` in solve/kernel/arrays.py"
+            )
     slices, bodies = rig.layout.slices, list(rig.bodies)
     pads, sizes = rig.pads.values(), [len(pad.mesh.surface) for pad in rig.pads.values()]
     base = [3 * (len(bodies) if pad.base is None else bodies.index(pad.base)) for pad in pads]
