@@ -45,6 +45,7 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
 
+autodoc_default_options = {"members": True, "exclude-members": "model_config"}
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
@@ -119,7 +120,8 @@ def retarget(app: Sphinx, *where: Any) -> None:
     content = where[-1]
     for there, here in RETARGETED.items():
         content[0] = content[0].replace(there, here)
-    content[0] = re.sub(r"\]\(\.\./examples/gallery/(\w+)\.py", r"](gallery/\1", content[0])
+    program = r"\]\(((?:\.\./)*)\.\./examples/gallery/(\w+)\.py"
+    content[0] = re.sub(program, r"](\1gallery/\2", content[0])
 
 
 def mathml(writer: Any, node: nodes.Node) -> None:

@@ -19,7 +19,8 @@ from torchsoft.files import save_text, write_json
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "experiments" / "results"
 PAGES = ("experiments/README.md", "experiments/validation/README.md", "docs/paper.md",
-         "docs/contact_theory.md", "docs/validation_identification.md")  # fmt: skip
+         "docs/comparison.md", "docs/contact_theory.md",
+         "docs/validation_identification.md")  # fmt: skip
 MARKED = re.compile(r"(<!-- table (\S+) (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

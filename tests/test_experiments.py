@@ -145,6 +145,18 @@ def contact_theory(found):
 
 
 @claims
+def peers(found):
+    """Positions after a slide are theory's, and their derivatives but for the ripple of nodes."""
+    table = found["tables"]["torchsoft"]
+    off = {
+        name: float(cell.rstrip("%")) for name, cell in zip(table["head"][1:], table["rows"][0][1:])
+    }
+    assert max(abs(off[name]) for name in ("block: x", "rolls: x")) < 0.2
+    assert max(abs(off[name]) for name in ("block: dx/dmu", "block: dx/dv")) < 0.5
+    assert abs(off["rolls: dx/dmu"]) < 5
+
+
+@claims
 def gradient_accuracy(found):
     """The windows are what they are called, and errors are 1e-6 where the judge is that good."""
     slip, stick, grasp = (found["windows"][name] for name in ("slip", "stick", "grasp"))

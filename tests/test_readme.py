@@ -44,9 +44,7 @@ ELSEWHERE = {
     "rehearse fit.toml": "test_sysid_rigs.py",
     "explain drive.csv": "test_sysid_suspects.py",
     "out/logs": "test_datasets.py",
-    "LeRobotDataset": "a package",
     "stable_baselines3": "test_envs.py",
-    "out/the_well": "a package",
     "out/rolling": "test_datasets_read.py",
 }
 """Parts of blocks that need more than a test has, and where they are tried instead."""

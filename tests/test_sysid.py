@@ -165,8 +165,6 @@ def test_what_the_data_do_not_determine_has_no_value():
     assert seen.ci95[0] < BASE.materials["rubber"].E < seen.ci95[1]
     weak = [one.facts["estimate"] for one in answer.findings if one.code == "not-identifiable"]
     assert weak == [MU_K]
-    assert not answer.directions[-1].identifiable
-    assert MU_K in answer.directions[-1].components
     row = next(e for e in json.loads(answer.to_json())["estimates"] if e["name"] == MU_K)
     assert row["value"] is None
     assert "not identifiable" in answer.table()

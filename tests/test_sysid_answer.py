@@ -41,7 +41,7 @@ from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Reading
 from torchsoft.sysid.report import figure, report
-from torchsoft.sysid.result import ChannelNoise, checksum, recorded_rigs
+from torchsoft.sysid.result import checksum, recorded_rigs
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
 
@@ -102,7 +102,7 @@ def full(result):
     )
     return replace(
         result, assumptions=[harmless, heavy, lost, other],
-        noise=[ChannelNoise("effort_y", NOISE, [])],
+        noise={"effort_y": NOISE},
         combinations=[Combination({E: 1.0, K_N: -0.5}, {E: 0.3, K_N: 0.4}, 0.02)],
         command="torchsoft identify '<a>.csv' rig.toml --out out",
     )  # fmt: skip
@@ -246,7 +246,7 @@ def forge(content: dict[str, Any]) -> None:
 DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "a digit": (lambda c: c["estimates"][1].update(last=1.25), "is damaged"),
     "no checksum": (lambda c: c.pop("checksum"), "is damaged"),
-    "another form": (lambda c: c.update(schema="torchsoft-answer-10"), "'torchsoft-answer-10'"),
+    "another form": (lambda c: c.update(schema="torchsoft-answer-99"), "'torchsoft-answer-99'"),
     "an old one": (lambda c: c.pop("schema"), "identify again"),
     "forged": (forge, r"\.x\.\d+ should be a valid number, not '0'"),
 }
@@ -435,7 +435,7 @@ def test_warnings_come_first_then_parameters_starts_and_sensors(page, full):
 
 
 def test_assumptions_that_matter_stand_open_and_others_are_folded(page):
-    folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
+    folded = page.text.index("\n1 that shift no estimate by more than 0.5 standard deviations\n")
     assert (
         page.text.index(f"\n−4.2 sd of {E}\n−3.1 ± 1.2 %\nsuspected: lowers the sum of ") < folded
     )

@@ -14,7 +14,7 @@ from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Referenc
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect, suspects
 from torchsoft.sysid.initial_state import Standing
-from torchsoft.sysid.prediction import Prediction, Readout, Signals, Term, lagged, predict
+from torchsoft.sysid.prediction import Prediction, Readout, Term, lagged, predict
 from torchsoft.sysid.problem import DIFFERENCE
 from torchsoft.sysid.recording import Grid, extended
 from torchsoft.sysid.runs import Runner
@@ -272,7 +272,7 @@ def reading(lag: float = 0.0, backlash: float = 0.0) -> Readout:
     """The channel y by a sensor with a gain of 1.2."""
     return Readout(
         "y", NOISE, None, None, gain=1.2, bias=0.0, drift=0.0, delay=0.0, middle=0.05,
-        terms=(Term("y", 0, 1.0),), lag=lag, backlash=backlash,
+        terms=(Term(0, 0, 1.0),), lag=lag, backlash=backlash,
     )  # fmt: skip
 
 
@@ -287,20 +287,20 @@ SWING = np.sin(60 * T)
 def test_derivatives_of_a_reading_are_those_of_differences(lag, backlash, wrt):
     """With respect to its fault and to the signal; weights are pulled back by the transpose."""
     times, step = T[3:-3], 1e-7
-    signals = Signals(T, ("y",), SWING[:, None], SWING[:, None, None])
-    _, slopes, by = reading(lag, backlash).expected(signals, times)
+    run = Prediction(T, SWING[:, None], SWING[:, None, None])
+    _, slopes, by = reading(lag, backlash).expected(run, times)
     near = [
-        reading(lag + part * (wrt == "lag"), backlash + part * (wrt != "lag")).expected(
-            signals, times
-        )[0]
+        reading(lag + part * (wrt == "lag"), backlash + part * (wrt != "lag")).expected(run, times)[
+            0
+        ]
         for part in (step, -step)
     ]
     np.testing.assert_allclose(by[wrt], (near[0] - near[1]) / (2 * step), rtol=1e-5, atol=1e-3)
-    louder = Signals(T, ("y",), (1 + step) * SWING[:, None], None)
-    more, same = (reading(lag, backlash).expected(one, times)[0] for one in (louder, signals))
+    louder = Prediction(T, (1 + step) * SWING[:, None])
+    more, same = (reading(lag, backlash).expected(one, times)[0] for one in (louder, run))
     np.testing.assert_allclose(slopes[:, 0], (more - same) / step, atol=1e-5)
     v = np.random.default_rng(0).standard_normal(len(times))
-    pulled = reading(lag, backlash).pulled_back(signals, times, v)
+    pulled = reading(lag, backlash).pulled_back(run, times, v)
     assert float(np.sum(pulled[:, 0] * SWING)) == pytest.approx(float(v @ slopes[:, 0]), rel=1e-9)
 
 
@@ -310,16 +310,16 @@ def test_a_low_pass_and_backlash_have_closed_forms():
     ramp = np.maximum(T - 0.02, 0.0)
     exact = np.where(T > 0.02, ramp - 5e-3 * (1 - np.exp(-ramp / 5e-3)), 0.0)
     np.testing.assert_allclose(lagged(T, ramp, 5e-3), exact, atol=1e-12)
-    signals, times = Signals(T, ("y",), SWING[:, None], SWING[:, None, None]), T[3:-3]
+    run, times = Prediction(T, SWING[:, None], SWING[:, None, None]), T[3:-3]
     turns, swing = (0.5 * np.pi / 60, 1.5 * np.pi / 60), SWING[3:-3]
     falls = np.where(times < turns[0], np.maximum(swing - 0.1, 0.0), np.minimum(swing + 0.1, 0.9))
     whole = np.where(times < turns[1], falls, np.maximum(swing - 0.1, -0.9))
-    read = reading(backlash=0.2).expected(signals, times)[0] / 1.2
+    read = reading(backlash=0.2).expected(run, times)[0] / 1.2
     np.testing.assert_allclose(read, whole, atol=2e-3)
-    value, _, by = reading().expected(signals, times)
+    value, _, by = reading().expected(run, times)
     np.testing.assert_allclose(value, 1.2 * swing, rtol=1e-12)
     np.testing.assert_array_equal(by["lag"], by["delay"])
-    just_shown = reading(backlash=NOISE).expected(signals, times)[0]
+    just_shown = reading(backlash=NOISE).expected(run, times)[0]
     np.testing.assert_allclose(by["backlash"], (just_shown - value) / NOISE, atol=1e-9)
     middle = reading().middle
     np.testing.assert_allclose(by["drift"], times - middle, atol=1e-12)

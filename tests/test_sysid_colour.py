@@ -49,11 +49,8 @@ def test_intervals_hold_under_coloured_noise_which_is_named_unless_it_was_declar
     own = problem(coloured, colour)
     stage = Stage("all", own.names, (E, K_N), 1e-4)
     answer = identify(own, plan=[stage], assumptions="trusted", tightenings=0)
-    assert {one.channel for one in answer.noise} == (set(SENSORS) if colour == "ar" else set())
-    for one in answer.noise:
-        assert one.model.order in (1, 2)
-        assert one.tried[0].order == 0
-        assert min(one.tried, key=lambda score: score.bic).order == one.model.order
+    assert answer.noise.keys() == (set(SENSORS) if colour == "ar" else set())
+    assert all(one.order in (1, 2) for one in answer.noise.values())
     said = [str(one) for one in answer.findings if one.code == "colour"]
     assert len(said) == (colour == "white")
     assert all("coloured in x_ball (order" in text for text in said)

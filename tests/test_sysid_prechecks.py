@@ -28,7 +28,7 @@ from torchsoft.sysid.prechecks import (
     setpoint_findings,
     together,
 )
-from torchsoft.sysid.prediction import Signals, readout
+from torchsoft.sysid.prediction import Prediction, readout
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
 
@@ -71,12 +71,11 @@ def runs(recordings):
     """Runs with the nominal parameters."""
     problem = Problem(list(recordings.values()), SENSORS, {E: Unknown()})
     jobs = problem.jobs(problem.coordinates.start, problem.names, LOOSE, None)
-    made = zip(recordings.items(), Runner(problem.recordings).run(jobs))
-    return {name: Signals(run.t, one.channels, run.signals, None) for (name, one), run in made}
+    return dict(zip(recordings, Runner(problem.recordings).run(jobs)))
 
 
 def looked_at(
-    recording: Recording, run: Signals | None = None, sensors: Mapping[str, Sensor] = SENSORS
+    recording: Recording, run: Prediction | None = None, sensors: Mapping[str, Sensor] = SENSORS
 ) -> list[Finding]:
     """What is found with the sensors that the recording has, against a run that is there, or one of
     its own."""
@@ -84,10 +83,7 @@ def looked_at(
     if run is None:
         problem = Problem([recording], mine, {E: Unknown()})
         return precheck(problem, Runner(problem.recordings))
-    span = float(recording.times[0]), float(recording.times[-1])
-    readouts = {
-        name: readout(recording.rig, name, sensor, {}, span) for name, sensor in mine.items()
-    }
+    readouts = {name: readout(recording, name, sensor, {}) for name, sensor in mine.items()}
     return findings(recording, mine, {name: (one, run) for name, one in readouts.items()})
 
 

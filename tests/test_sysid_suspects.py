@@ -237,7 +237,8 @@ LEFT: dict[str, Any] = {"fails_best": (ALARM,), "fails_besides": (ALARM,)}
     ("tests", "found", "code", "says"),
     [
         ([none], {"fails_as_stated": ()}, "", ""),
-        ([a, none], {}, "cause", "that a is 1: the sum of squares falls by 300 with a = 1.05 "
+        ([a, none], {}, "cause",
+         "that a is 1: the sum of squares falls from 1000 to 700 with a = 1.05 "
          f"(+5 % ± 0.5). {E} would move by 0.4 standard deviations; estimates under it: {E} = 8e"),
         ([a, suspect("b", 299.0), suspect("c", 200.0)], {}, "causes",
          "2 assumptions, and cannot tell which: a = 1.05 (+5 % ± 0.5), score 0.56, b = 1.05"),
@@ -255,7 +256,7 @@ LEFT: dict[str, Any] = {"fails_best": (ALARM,), "fails_besides": (ALARM,)}
          "With d also free nothing would be left."),
         ([linear("a", 300.0), linear("b", 250.0)], {}, "rivals",
          "one of 2 assumptions: a = 1.05 (+5 % ± 0.5), b = 1.05"),
-        ([none], LEFT | {"searched": True}, "none", "None of the 1 refitted suspects"),
+        ([none], LEFT | {"searched": True}, "none", "1 of 1 suspects were refitted"),
         ([linear("c", 2.0)], LEFT, "no-suspect", "c (0% of the misfit)"),
         ([linear("c", 2.0)], {"fails_as_stated": ()}, "", ""),
     ],
@@ -304,10 +305,10 @@ def test_the_largest_undetectable_shift_and_hints_are_named():
     found = {one.code: one for one in risk_findings(concluded(tests))}
     assert {*found} == {"undetectable", "untestable", "undetectable-others", "contradicted"}
     assert all(one.severity == "note" for one in found.values())
-    assert f"shift is 6 standard deviations of {E}: a may differ by 3 %" in str(
+    assert f"6 standard deviations of {E}. It occurs if a differs by 3 %" in str(
         found["undetectable"]
     )
-    assert f"{E} depends on far, which no residual can test: 1 % of it" in str(found["untestable"])
+    assert "which these data cannot test: an error of 1 % shifts it" in str(found["untestable"])
     assert str(found["undetectable-others"]).endswith(
         "up to 4 standard deviations without being detected: x."
     )

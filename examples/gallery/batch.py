@@ -1,9 +1,9 @@
 """
-A batch with parameters of their own
-====================================
+A batch of runs with different parameters
+=========================================
 
-Which rubber grips best? Sixteen runs side by side in threads, each with a stiffness and a friction
-of its own, and one gradient for all of them.
+Which rubber grips best? Sixteen runs take place side by side in threads, each with another
+stiffness and friction, and one backward pass gives the gradients of all of them.
 """
 
 import matplotlib.pyplot as plt
@@ -24,11 +24,11 @@ print(f"{len(batch)} runs in {batch.wall_s:.1f} s; failed: {batch.failures or 'n
 
 # slip: how far the disc is from where the bracket would have rolled it
 wander = (batch["x_C"] - batch["x_C"][:, :1]).square().mean(1).sqrt()
-wander.sum().backward()  # of every run by its own E and mu
+wander.sum().backward()  # of every run with respect to its E and mu
 
 _, (left, right) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained")
 left.plot(1e-6 * E.detach(), 1e3 * wander.detach(), "o-")
 left.set(xlabel="E [MPa]", ylabel="travel of the disc, rms [mm]")
 right.plot(1e-6 * E.detach(), 1e3 * mu.grad, "o-")
-right.set(xlabel="E [MPa]", ylabel="slope by mu [mm]")
+right.set(xlabel="E [MPa]", ylabel="d(travel) / d(mu) [mm]")
 plt.show()

@@ -2,8 +2,8 @@
 A block, a curved pad, a fingertip
 ==================================
 
-How does the face of a pad decide its stiffness? Each is pressed against the same rod of 20 mm
-radius by a driven base; the curves are force against travel.
+How does the shape of a pad's face affect its stiffness? A driven base presses each pad against the
+same rod of 20 mm radius; the curves show force against travel.
 """
 
 import matplotlib.pyplot as plt

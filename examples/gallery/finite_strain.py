@@ -1,9 +1,9 @@
 """
-Rubber at real strains
-======================
+Rubber at finite strain
+=======================
 
-When are linear pads too soft? A layer of rubber that is pressed by a sixth of its height is stiffer
-than linear theory has it: the same grasp with linear pads and with neo-Hookean ones.
+When are linear pads too soft? A layer of rubber that is compressed by a sixth of its height is
+stiffer than linear theory predicts. The same grasp is run with linear and with neo-Hookean pads.
 """
 
 import matplotlib.pyplot as plt

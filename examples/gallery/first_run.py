@@ -3,7 +3,7 @@ The paper's manipulation
 ========================
 
 How does the contact force spread over the pads while the disc rolls? A disc is grasped between two
-rubber pads and rolled by 20 mm; the picture shows the forces on every touching node at 5 s.
+rubber pads and rolled by 20 mm; the picture shows the force on every node in contact at 5 s.
 """
 
 from torchsoft import RigFile

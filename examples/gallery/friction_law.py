@@ -1,9 +1,9 @@
 """
-A friction law of your own
-==========================
+A custom friction law
+=====================
 
-How does a run depend on a number that only your law has? In the law below friction falls with the
-pressure, as rubber's does; it is compiled, with its derivatives, when the run begins.
+How does a run depend on a parameter of a custom law? In the law below friction falls with the
+normal force, as with rubber. The law and its derivatives are compiled when the run starts.
 """
 
 import matplotlib.pyplot as plt
@@ -15,8 +15,8 @@ from torchsoft import RigFile, excite
 
 class Pressed(nn.Module):
     """Slip rate [m/s] of an effort E [N] under a normal force F_N [N] with a dashpot R [N.s/m]:
-    (R + F_N / v_eta) |rate| = E - mu F_N above it. mu falls with the pressure of the point, and
-    friction grows with the slip rate over v_eta [m/s]."""
+    (R + F_N / v_eta) |rate| = E - mu F_N above it. mu falls with the normal force, and friction
+    grows with the slip rate over v_eta [m/s]."""
 
     def __init__(self, mu: float, fall: float, v_eta: float = 1.0) -> None:
         super().__init__()
@@ -46,6 +46,6 @@ for fall in (0.0, 0.05, 0.2):
     again = file.build({law: Pressed(mu=0.7, fall=fall)}).run()
     change = 1e3 * (again["theta"] - run["theta"].detach())
     axes.plot(again.t, change, label=f"fall = {fall:g} 1/N")
-axes.set(xlabel="time [s]", ylabel="angle beside 0.05 1/N [mrad]")
+axes.set(xlabel="time [s]", ylabel="change from 0.05 1/N [mrad]")
 axes.legend()
 plt.show()

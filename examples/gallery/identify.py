@@ -2,9 +2,8 @@
 Identification from a CSV file
 ==============================
 
-How stiff and how grippy are the pads of the rig on the bench? Its recording is a CSV file with
-units in the headings; what is unknown is said in a few lines, and intervals come with the
-estimates.
+How stiff are the pads of a rig, and how large is their friction? The recording is a CSV file with
+units in the headings. A few lines of TOML state what is unknown; estimates come with intervals.
 """
 
 import tempfile
@@ -26,7 +25,7 @@ actuators.x.measures = "bracket.x"
 bodies.disc.start.x = 60.3e-3
 bodies.bracket.start.x = 60.3e-3
 laws.steel_on_rubber = {K_n = 1.6e5, R_t = 300.0, friction = {v_s = 0.05, mu_k = 0.5}}
-[unknowns]                       # where the search begins
+[unknowns]                       # where the search starts
 "materials.rubber.E" = {nominal = 0.45e6}
 "materials.rubber.tau" = {nominal = 20e-3}
 "laws.steel_on_rubber.friction.mu_s" = {nominal = 0.9, low = 0.5}

@@ -1,9 +1,9 @@
 """
-A friction law of your own, identified
-======================================
+Identification of a custom friction law
+=======================================
 
-Does friction fall with pressure, and how fast? The law has two numbers that no table of torchsoft
-knows; they are unknowns like any other, by their names in the module.
+Does friction fall with the normal force, and how fast? The two parameters of a custom law are
+unknowns like any other, by their names in the module.
 """
 
 import matplotlib.pyplot as plt
@@ -28,14 +28,14 @@ class Pressed(nn.Module):
         return (E - mu * F_N).clamp(min=0.0) / (R + F_N / 0.05)
 
 
-# a bench is stood in for by the simulator: a light grasp, jerked, with noise of the sensors
+# the simulator replaces a bench: a light grasp, jerked, with noise of the sensors
 coarse = {"pad.elements_x": 60, "pad.elements_y": 2}
 file = excite(RigFile.ready("paper").override(coarse), "hard light jerks")
 sensors = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
 law = "laws.steel_on_rubber.friction"
 truth = {f"{law}.mu": 0.7, f"{law}.fall": 0.05}
 bench = file.build({law: Pressed(*truth.values())})
-known = file.build({law: Pressed(mu=0.5, fall=0.02)})  # where to begin
+known = file.build({law: Pressed(mu=0.5, fall=0.02)})  # the start
 made = record("bench", known, bench.rig, sensors)
 problem = Problem([made], sensors, {name: Unknown() for name in truth})
 result = identify(problem, rtol=1e-4, assumptions="trusted")
@@ -46,7 +46,7 @@ force = torch.linspace(0, 12, 100)
 for label, (mu, fall) in {
     "truth": truth.values(),
     "identified": [result[name].value for name in truth],
-    "begin": (0.5, 0.02),
+    "start": (0.5, 0.02),
 }.items():
     plt.plot(force, mu * torch.exp(-fall * force), label=label)
 plt.gca().set(xlabel="normal force of a node [N]", ylabel="coefficient of friction", ylim=(0, None))

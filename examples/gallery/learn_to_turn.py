@@ -3,8 +3,8 @@ A policy trained by the gradient of its episodes
 ================================================
 
 Can two soft jaws learn in fifty episodes to turn a disc to any angle? The environment is one of
-gymnasium's, for any library of reinforcement learning; its step in torch has a gradient, by which
-the distances to the goal in a whole episode are differentiated by the weights of the policy.
+gymnasium's, for any library of reinforcement learning. Its step in torch has a gradient, so that
+the distances to the goal are differentiated with respect to the weights of the policy.
 """
 
 import gymnasium
@@ -20,7 +20,7 @@ policy = nn.Sequential(nn.Linear(seen, 30), nn.Tanh(), nn.Linear(30, actions), n
 
 
 def evaluate(seeds: range) -> list[float]:
-    """Angles [rad] that are missed at the end of episodes, as gymnasium takes them."""
+    """Errors of the angle [rad] at the end of gymnasium's episodes."""
     missed = []
     for seed in seeds:
         (observation, _), over = env.reset(seed=seed), False

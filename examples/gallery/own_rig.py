@@ -1,9 +1,9 @@
 """
-A rig of your own
-=================
+A rig built in Python
+=====================
 
 How far does a disc roll when the pad above it is pushed? Two pads are driven along a path, a disc
-lies between them and goes where friction takes it. No controller, and one gradient at the end.
+lies between them and is moved by friction. There is no controller, and one gradient at the end.
 """
 
 import torch
@@ -11,7 +11,7 @@ import torch
 import torchsoft as ts
 from torchsoft.plot.figures import snapshots
 
-# parts: a rubber, a contact law, two pads, and three bodies, two of which move as they are told
+# parts: a rubber, a contact law, two pads, and three bodies, two of which are driven
 rubber = ts.KelvinVoigt(E=0.75e6, nu=0.45, rho=1100.0, tau=10e-3, depth=44e-3)
 law = ts.SoftContact(
     K_n=1.2e5, R_n=440.0, K_t=1.2e5, R_t=440.0, friction=ts.SmoothSlip(0.8, 0.7, v_s=0.05)

@@ -2,9 +2,8 @@
 A motion found by gradient
 ==========================
 
-How must the bracket move so that the disc ends 8 mm to the left, as calmly as possible? The values
-at the knots of the set-point are unknowns like any other; the adjoint differentiates the run by
-all of them.
+How must the bracket move so that the disc ends 8 mm to the left, with small forces? The values at
+the knots of the set-point are unknowns, with respect to which the adjoint differentiates the run.
 """
 
 import matplotlib.pyplot as plt
@@ -24,7 +23,7 @@ runs, history = [], []
 
 
 def loss() -> torch.Tensor:
-    """Miss at the end [mm2], forces, and curvature of the set-point; leaves the gradient in u."""
+    """Error at the end [mm2], forces, and curvature of the set-point, with the gradient in u."""
     optimiser.zero_grad()
     knots = torch.cat((torch.zeros(1), u)).double()
     reference = Reference(x_d=Sampled(times, x_0 + 1e-2 * knots), **grasp)

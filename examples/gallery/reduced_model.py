@@ -2,8 +2,8 @@
 A reduced model
 ===============
 
-How few terms describe the disc in the grip? Small taps of a settled grasp are fitted with pysindy
-in the terms of mechanics, and a motion that was held out is rolled out.
+How few terms describe the disc in the grip? pysindy fits the terms of mechanics to small impulses
+of a settled grasp; the equations then predict a motion that was held out.
 """
 
 import matplotlib.pyplot as plt
@@ -19,7 +19,7 @@ held = {name: Profile([0.0], file.motion[name].values[-1:]) for name in ("y_d", 
 begin = file.build().run([0.0, 1.0]).y[-1]
 
 
-def tapped(seed: int, size: float, end: float) -> Record:
+def impulse(seed: int, size: float, end: float) -> Record:
     """A record of the settled grasp under a multi-sine of the set-point about where it is."""
     torch.manual_seed(seed)
     f = torch.logspace(0.5, 2.1, 10).tolist()
@@ -33,14 +33,14 @@ def tapped(seed: int, size: float, end: float) -> Record:
     return record(simulate(rig, t, y0=y, reference=reference, step=2.5e-4))
 
 
-taps = [tapped(seed, 3e-6, 0.3) for seed in range(8)]
+impulses = [impulse(seed, 3e-6, 0.3) for seed in range(8)]
 K, R = file.actuators["x"].Kp, file.actuators["x"].Kd
 law = {"F_x": {"x_d": K, "x_d_dot": R, "x_C": -K, "v_C": -R}}  # Eq. 33, 34
 recipe = Recipe(threshold=0.05, width=0.004, window=0.3)
-reduced = fit(assemble(taps, mechanics(r=18.35e-3), recipe), recipe, law)
+reduced = fit(assemble(impulses, mechanics(r=18.35e-3), recipe), recipe, law)
 print(reduced)
 
-other = tapped(99, 6e-6, 0.3)
+other = impulse(99, 6e-6, 0.3)
 out = rollout_of(reduced, other)
 print(f"held out: within {score(reduced, other).worst:.2%} of the range, {1e3 * out.wall_s:.1f} ms")
 plt.figure(figsize=(7, 3), layout="constrained")

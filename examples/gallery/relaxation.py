@@ -2,8 +2,8 @@
 A rubber from a relaxation test
 ===============================
 
-How much force does a grasp lose while it waits? A test with a step of strain gives the series of
-the rubber, and the pads are then made of it.
+How much force does a grasp lose over time? A test with a step of strain determines the Prony
+series of the rubber, of which the pads are then made.
 """
 
 import tempfile
@@ -17,7 +17,7 @@ from torchsoft import Prony, RigFile
 from torchsoft.materials.fit import fit
 from torchsoft.materials.measured import Measured, read
 
-# a file as a laboratory writes it: 2 % of strain held from t = 0 on, stress with 0.5 % of noise
+# a file of a laboratory: 2 % of strain held from t = 0 on, stress with 0.5 % of noise
 rng, seconds = np.random.default_rng(1), np.geomspace(1e-2, 30.0, 200)
 modulus = 0.5e6 + 0.2e6 * np.exp(-seconds / 0.1) + 0.15e6 * np.exp(-seconds / 2.0)
 stress = 0.02 * modulus * (1 + 0.005 * rng.standard_normal(200))

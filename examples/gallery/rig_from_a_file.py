@@ -2,8 +2,8 @@
 A rig from a file
 =================
 
-What does an ellipse do that falls askew onto a soft pad? The rig is one of the ready files;
-``torchsoft run drop`` does the same without any Python.
+How does a tilted ellipse fall onto a soft pad? The rig is one of the ready files;
+``torchsoft run drop`` does the same on the command line.
 """
 
 import matplotlib.pyplot as plt

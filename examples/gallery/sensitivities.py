@@ -2,8 +2,8 @@
 Sensitivities over time
 =======================
 
-When does a recording know about a parameter? Forward sensitivities are the derivative of every
-sample by a handful of parameters, from one run.
+Which samples of a recording depend on which parameter? Forward sensitivities are the derivatives of
+every sample with respect to a few parameters, from one run.
 """
 
 import matplotlib.pyplot as plt

@@ -2,7 +2,7 @@
 Objects that are not round
 ==========================
 
-How does the grip change when the object is an ellipse, or a box with rounded corners? All three
+How does the grip change if the object is an ellipse, or a box with rounded corners? All three
 are grasped by 1.5 mm and rolled to the left along the same motion.
 """
 
@@ -25,7 +25,7 @@ for name, shape in objects.items():
     run = file.build({"bodies.disc.shape": shape}).run()
     normal = run.force["L"][..., 0].sum(-1)
     touching = int((run.force["L"][-1, :, 0] > 0).sum())
-    print(f"{name:22s} turns by {run['theta'][-1]:.3f} rad, {touching} nodes touch at the end")
+    print(f"{name:22s} turns by {run['theta'][-1]:.3f} rad, {touching} nodes in contact at the end")
     above.plot(run.t, normal, label=name)
     below.plot(run.t, 1e3 * run["y_Br"], label=name)
 above.set_ylabel("force on the lower pad [N]")

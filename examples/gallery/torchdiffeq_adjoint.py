@@ -2,8 +2,8 @@
 With torchdiffeq
 ================
 
-Can the model stand in a program that is built on torchdiffeq? A rig is a right-hand side f(t, y):
-``odeint`` takes it, ``odeint_adjoint`` differentiates it, and the stepper is one of the methods.
+Can the model be used in a program that is built on torchdiffeq? A rig is a right-hand side f(t, y)
+for ``odeint``, ``odeint_adjoint`` differentiates it, and the stepper is one of the methods.
 """
 
 import time
@@ -36,7 +36,7 @@ def timed(name: str, solve) -> None:
     slope = float(model.parameter("contact.K_n").grad) * 1.2e5
     wall = time.perf_counter() - began
     moved = 1e9 * float((y[-1, height] - y0[height]).detach())
-    print(f"{name:20s} moved by {moved:.0f} nm, slope by ln(K_n) {slope:+.0f} nm, {wall:.2f} s")
+    print(f"{name:20s} moved by {moved:.0f} nm, d/d ln(K_n) {slope:+.0f} nm, {wall:.2f} s")
     walls[name] = wall
 
 

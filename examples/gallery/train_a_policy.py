@@ -2,8 +2,8 @@
 A policy trained by gradient
 ============================
 
-Can a small network roll the disc where it should go? It sees disc and bracket and pushes the
-bracket, in place of the horizontal PD loop; the adjoint of the run reaches its weights.
+Can a small network roll the disc to its target? It observes disc and bracket and pushes the
+bracket, in place of the horizontal PD loop. The adjoint of the run reaches its weights.
 """
 
 import matplotlib.pyplot as plt

@@ -3,7 +3,7 @@ Which motion shows which parameter
 ==================================
 
 What should be recorded to find friction, and what to find damping? The Fisher matrix of each
-motion says how well its recording would determine each parameter, before anything is built.
+motion predicts how well its recording would determine each parameter, before anything is built.
 """
 
 import matplotlib.pyplot as plt
@@ -24,7 +24,7 @@ for row, motion in enumerate(motions):
     t = torch.arange(0, 1.5, 0.005, dtype=torch.float64)
     run = built.run(t, gradient="forward", wrt=names, rigid=True)
     sizes = torch.stack([built.rig.parameter(name).detach() for name in names])
-    J = run.sensitivities.detach() * sizes  # by the logarithms
+    J = run.sensitivities.detach() * sizes  # with respect to logarithms
     measured = {"disc": ("x", "y", "theta"), "bracket": ("x", "y")}
     rows, layout = [], built.rig.layout
     for body, axes_ in measured.items():

@@ -36,8 +36,8 @@ GRAVITY, MU, RTOL = 9.81, 0.5, 1e-4
 E, TAU, SPRINGS = 500.0, 1e-3, 100.0
 """Modulus and retardation time of the pad; K_n and K_t of an area, in units of E / L."""
 
-LENGTH, ELEMENTS, LAYERS = 20.0, 8, 6
-"""Length of the pad, elements along a height of it, and through it."""
+LENGTH = 20.0
+"""Length of the pad."""
 
 
 def f64(*values: float) -> Tensor:
@@ -52,11 +52,13 @@ def along(run: Trajectory, angle: float) -> Array:
 
 @dataclass(frozen=True)
 class Sliding:
-    """A body of `mass` [kg] on a pad of height `size` [m]."""
+    """A body of `mass` [kg] on a pad of height `size` [m] with `elements` along this height."""
 
     mass: float = 0.15
     size: float = 12e-3
     friction: SlipLaw = field(default_factory=lambda: Coulomb(MU, MU))
+    tau: float = TAU
+    elements: int = 8
 
     @property
     def time(self) -> float:
@@ -71,12 +73,12 @@ class Sliding:
         return RoundedBox(1.7 * self.size, 0.8 * self.size, radius=0.3 * self.size)
 
     def rig(self, shape: Shape, angle: float = 0.0, gravity: float = GRAVITY) -> Rig:
-        L, spacing, depth = self.size, self.size / ELEMENTS, 3 * self.size
-        modulus, tau = E * self.mass * GRAVITY / L**2, TAU * self.time
+        L, spacing, depth = self.size, self.size / self.elements, 3 * self.size
+        modulus, tau = E * self.mass * GRAVITY / L**2, self.tau * self.time
         K = SPRINGS * modulus / L * depth * spacing
         R = 0.1 * K * tau
         law = SoftContact(K, R, K, R, friction=self.friction, node_spacing=spacing)
-        mesh = PadMesh(LENGTH * L, L, round(LENGTH * ELEMENTS), LAYERS)
+        mesh = PadMesh(LENGTH * L, L, round(LENGTH * self.elements), 3 * self.elements // 4)
         material = KelvinVoigt(modulus, 0.45, 1e3, tau, depth)
         return Rig(
             bodies={"body": Body(self.mass, shape)},
@@ -85,11 +87,10 @@ class Sliding:
             gravity=gravity,
         )
 
-    def run(
-        self, shape: Shape, at: float, t: Tensor, angle: float = 0.0, v: float = 0.0,
-        omega: float = 0.0,
-    ) -> Trajectory:  # fmt: skip
-        """The body from a place `at` [m] along a slope, with v [m/s] along it and omega [rad/s]."""
+    def start(
+        self, shape: Shape, at: float, angle: float = 0.0, v: float = 0.0, omega: float = 0.0
+    ) -> tuple[Rig, Tensor]:
+        """The body at a place `at` [m] along a slope, with v [m/s] along it and omega [rad/s]."""
         level = self.rig(shape, gravity=GRAVITY * math.cos(angle))
         x, y, _ = level.unpack(level.state(body={"x": at, "y": "rest"})).pose["body"].tolist()
         rig = self.rig(shape, angle)
@@ -97,12 +98,16 @@ class Sliding:
         y0 = standing(rig, {"body": torch.cat((place, f64(angle)))})
         velocity = f64(v * math.cos(angle), v * math.sin(angle), omega)
         y0[rig.layout.slices["velocity", "body"]] = velocity
+        return rig, y0
+
+    def run(self, shape: Shape, at: float, t: Tensor, **start: float) -> Trajectory:
+        rig, y0 = self.start(shape, at, **start)
         return simulate(rig, t, y0=y0, rtol=RTOL)
 
     def slope(self, degrees: float) -> dict[str, float]:
         """Acceleration of a box down a slope, from the second half of its way."""
         angle, t = math.radians(degrees), grid(5 * self.time, 0.05 * self.time)
-        way = -along(self.run(self.box, 16 * self.size, t, angle), angle)
+        way = -along(self.run(self.box, 16 * self.size, t, angle=angle), angle)
         half = slice(len(t) // 2, None)
         expected = max(0.0, GRAVITY * (math.sin(angle) - MU * math.cos(angle)))
         found = float(2 * np.polyfit(t[half].numpy(), way[half], 2)[0])

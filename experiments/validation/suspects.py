@@ -389,22 +389,19 @@ def repeat(case: Case, made: Sequence[Made], seed: int, config: Settings) -> Rep
 def table(cases: list[dict[str, Any]]) -> Table:
     rows = []
     for one in cases:
-        odds = sorted(one["odds"].items(), key=lambda item: -item[1])[:4]
-        seeds, sizes = len(one["worst"]), [abs(z) for z in one["worst"]]
-        worst = int(np.argmax(sizes))
+        odds = sorted(one["odds"].items(), key=lambda item: -item[1])[:2]
+        worst = int(np.argmax(np.abs(one["worst"])))
         of = one["worst_of"][worst].rpartition(".")[2]
         rows.append((
             one["name"], f"{one['held']} of {one['of']}",
-            f"{min(sizes):.1f} .. {sizes[worst]:.1f} {of}".rstrip(),
+            f"{abs(one['worst'][worst]):.1f} {of}".rstrip(),
             ", ".join(f"{outcome} ({count})" for outcome, count in one["outcomes"].items()),
             one["frozen"],
             ", ".join(f"{name} ({x:.2g})" for name, x in odds) or "-",
-            f"{one['named']} of {seeds}", one["false"], one["silent"],
             f"{one['identify_s']:.0f}", f"{one['explain_s']:.0f}" if one["explain_s"] else "-",
         ))  # fmt: skip
     head = ("what differs", "intervals that hold", "worst error / sd", "outcome",
-            "frozen", "named (mean odds)", "rightly in", "false cause", "silent", "identify [s]",
-            "explain [s]")  # fmt: skip
+            "frozen", "named (mean odds)", "identify [s]", "explain [s]")  # fmt: skip
     return Table(head, rows)
 
 

@@ -8,9 +8,9 @@ from typing import Any
 from torchsoft.cli.results import add_command, add_yes, failed, say
 
 MAKE = """\
-Simulates the dataset of CONFIG.toml, shard by shard, into a folder or what fsspec opens. Ctrl-C and
-kill are safe at any moment, and the same command makes what is missing. Any number of processes may
-write into one folder: --part 2/8 makes every eighth shard from the second on."""
+Simulates the dataset of CONFIG.toml, shard by shard, into a folder or any URL that fsspec opens. It
+may be interrupted or killed at any time; the same command then makes the missing shards. Any number
+of processes may write into one folder: --part 2/8 makes every eighth shard from the second on."""
 
 MOST = 1000
 """Most local workers."""

@@ -16,12 +16,11 @@ from torchsoft.cli.results import (
 DESIGN = """\
 Which motion of the rig should be recorded?
 
-CONFIG.toml plans an identification (a rig file, unknowns, sensors with their noise), and has in
-[design] candidates for the motion, and bounds within which the knots of profiles may move. Ranks
-the candidates by what identifies the unknowns best, moves the knots of the best one by gradient,
-and writes it as motion.toml, a rig file that runs, with design.json. The file is run again, and
-the exit status is 1 where it tells something else than the search. DATA are recordings that there
-are already."""
+CONFIG.toml plans an identification (a rig file, unknowns, sensors with their noise). Its [design]
+lists candidates for the motion, and bounds within which the knots of profiles may move. The command
+ranks the candidates by how well they identify the unknowns, improves the knots of the best one by
+gradient, and writes it as motion.toml, a rig file that runs, with design.json. It runs this file
+again; the exit status is 1 if the result differs. DATA are existing recordings."""
 
 
 def add_commands(commands: Any) -> None:

@@ -17,30 +17,29 @@ from torchsoft.cli.results import (
 )
 
 IDENTIFY = """\
-Which parameters explain these recordings, and how sure is that?
+Which parameters explain these recordings, and with which uncertainty?
 
 DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta
-[deg]`, or runs of this project (.nc, .mcap). CONFIG.toml states what is known, what is
-unknown and how good the sensors are; examples/identify has both. Recordings that look wrong (a
-sign, a unit, set-points too far apart) are rejected or reported before the fit. Writes
-answer.json and report.html, and comparison.json where there are competing laws. Interrupted, the
-same command continues where it was."""
+[deg]`, or runs of torchsoft (.nc, .mcap). CONFIG.toml states the rig, the unknowns and the noise of
+the sensors; examples/identify has both. Recordings with a wrong sign or unit, or with set-points
+too far apart, are rejected or reported before the fit. Writes answer.json and report.html, and
+comparison.json if laws compete. After an interruption the same command continues."""
 
 
 EXPLAIN = """\
 Why does the model not explain these recordings?
 
-Identifies as `identify` does. Where no test of an assumption explains the misfit, refits the data
-with one assumption released at a time, until one explains the data or the refits took --effort
-times the work of the fit. With the checkpoint of an identification it starts where that ended."""
+Identifies as `identify` does. If no test of an assumption explains the misfit, refits the data
+with one assumption free at a time, until one explains the data or the refits took --effort
+times the work of the fit. With the checkpoint of an identification it continues from there."""
 
 
 REHEARSE = """\
 What would this experiment identify?
 
 Simulates the recordings that CONFIG.toml plans (a rig file, its motions, sensors with their noise,
-[rehearsal] with the rate), identifies from them, and shows which numbers would come out, with which
-intervals. The CSV files it writes are templates of those to record."""
+[rehearsal] with the rate), identifies from them, and shows which parameters are identifiable, with
+their intervals. The CSV files that it writes are templates for the recordings."""
 
 
 def add_commands(commands: Any) -> None:
@@ -66,9 +65,7 @@ def add_arguments(one: argparse.ArgumentParser) -> None:
         type=float,
         help="relative tolerance that chooses the simulation's steps (fit.rtol)",
     )
-    one.add_argument(
-        "--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)"
-    )
+    one.add_argument("--checkpoint", type=Path, help="folder for unfinished work (OUT/unfinished)")
     add_yes(one)
     add_progress(one)
     verb = one.prog.split()[-1]

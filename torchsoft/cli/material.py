@@ -12,24 +12,27 @@ if TYPE_CHECKING:
     from torchsoft.materials.fit import Fit
 
 MATERIAL_FIT = """\
-Which material did this in a test?
+Which material belongs to this test?
 
-FILE is a table (CSV, or an Excel workbook) whose headings have units, `stress [MPa]`, in any
-order: over time `t` with one of `strain`, `stretch`, `elongation` and one of `stress`, `force`,
-nominal and along the one direction of the test; or `t` with `modulus` or `compliance` alone, of a
-strain or a stress put on at t = 0 and held; a frequency sweep `frequency` with `storage_modulus`
-and `loss_modulus`, or `storage_shear_modulus` and `loss_shear_modulus`, or `tan_delta` as the
-second; a pull without `t`, of which --range says the strains that its modulus is of, or --energy
-the strain energy that it is to have, with --also for further tables and --relaxation for its
-branches. The whole history counts: ramps need not be cut off.
+FILE is a table (CSV, or an Excel workbook) whose headings have units, `stress [MPa]`, in any order:
 
-A relaxation test and a sweep give a relaxation series (prony), a creep test a generalised Kelvin
-chain, a pull a modulus (kelvin_voigt). Reports what the rows do not determine. Writes
-material.toml, with the names of the constructor's arguments, summary.json and fit.png."""
+- relaxation or creep: `t`, one of `strain`, `stretch`, `elongation`, and one of `stress`, `force`,
+nominal and along the direction of the test; or `t` with `modulus` or `compliance` alone, for a step
+at t = 0;
+- a frequency sweep: `frequency` with `storage_modulus` and `loss_modulus`, or
+`storage_shear_modulus` and `loss_shear_modulus`, or `tan_delta` as the second;
+- tension, compression or shear, with or without `t`: --range states the strains of the modulus, or
+--energy the strain energy, with --also for further tables and --relaxation for its branches.
+
+Ramps need not be cut off: the fit uses the whole history.
+
+Relaxation tests and sweeps give a relaxation series (prony), creep tests a generalised Kelvin
+chain, tension tests a modulus (kelvin_voigt). Reports what the test does not determine. Writes
+material.toml, summary.json and fit.png."""
 
 PRESETS = """\
-Rubbers from the literature, every coefficient marked `published`, with where, `fitted` to published
-tests, or `assumed`."""
+Lists rubbers from the literature. Every coefficient is marked `published`, with its source,
+`fitted` to published tests, or `assumed`."""
 
 
 def add_commands(commands: Any) -> None:
@@ -45,47 +48,46 @@ def add_commands(commands: Any) -> None:
     one.add_argument(
         "--test",
         choices=("relaxation", "creep", "sweep", *PULLS),
-        help="what was put on: strain, or stress, frequencies (by the columns, and by what was "
-        "held), a pull, a compression, a pull of held width, one in two directions, a shear",
+        help="kind of test (by default from the columns); planar is tension at constant width, "
+        "biaxial tension in two directions",
     )
     one.add_argument(
         "--energy", choices=ENERGIES,
-        help="strain energy of finite strains that is fitted to a pull, a compression or a shear",
+        help="strain energy that is fitted to a test in tension, compression or shear",
     )  # fmt: skip
     one.add_argument(
         "--also", action="append", default=[], metavar="TEST=FILE",
-        help="a further table of the same columns for the energy, as shear=FILE.csv; again for "
-        "others",
+        help="a further table for the energy, such as shear=FILE.csv; may be repeated",
     )  # fmt: skip
     one.add_argument(
         "--relaxation", metavar="FILE",
-        help="a relaxation test whose series are the branches of the energy",
+        help="a relaxation test, whose series gives the branches of the energy",
     )  # fmt: skip
     one.add_argument(
         "--fast", action="store_true",
-        help="the tables of the energy were fast against that series, and not slow",
+        help="the tests of the energy were fast compared with the relaxation, not slow",
     )  # fmt: skip
     one.add_argument(
         "--true", action="store_true",
-        help="stresses are per cross-section as it is, not as it was before the test",
+        help="stresses are true, not nominal",
     )  # fmt: skip
     one.add_argument(
         "--terms", type=int,
-        help="terms of the series (as many as the data call for), or of ogden (one)",
+        help="terms of the series (by the Bayesian information criterion), or of ogden (one)",
     )  # fmt: skip
     for name, meaning in SIZES.items():
         one.add_argument(f"--{name}", type=float, help=meaning)
     one.add_argument(
         "--range", type=float, nargs=2, metavar=("LOW", "HIGH"),
-        help="strains [1] between which the modulus of a pull is taken",
+        help="strains [1] between which the modulus is fitted",
     )  # fmt: skip
     one.add_argument(
         "--column", action="append", default=[], metavar="NAME=HEADING",
-        help="the heading in the file of a column, as force=Standardkraft; again for others",
+        help="heading of a column in the file, such as force=Standardkraft; may be repeated",
     )  # fmt: skip
     one.add_argument(
         "--ignore", action="append", default=[], metavar="HEADING",
-        help="a column to leave out; again for others",
+        help="a column to leave out; may be repeated",
     )  # fmt: skip
     for name, (value, meaning) in ASSUMED.items():
         one.add_argument(f"--{name}", type=float, help=f"{meaning} (assumed: {value:g})")
@@ -100,7 +102,7 @@ ASSUMED = {
     "nu": (0.45, "Poisson's ratio [1], which no test in one dimension determines"),
     "rho": (1100.0, "density [kg/m3], which no test determines"),
     "depth": (44e-3, "depth of the pads [m]"),
-    "tau": (10e-3, "retardation time [s], which a pull does not determine"),
+    "tau": (10e-3, "retardation time [s], which a tension test does not determine"),
 }
 """Values that a test may not determine: assumed values and meanings."""
 

@@ -7,16 +7,15 @@ from typing import Any
 from torchsoft.cli.results import add_command, add_out, add_progress, say, try_folder
 
 PLAN = """\
-Which motion brings the rig where it is wanted?
+Which motion brings the rig to its goal?
 
-RIG.toml is a rig file that runs, with a motion to begin with. GOAL.toml has [free.NAME] for every
+RIG.toml is a rig file with an initial motion. GOAL.toml has [free.NAME] for every
 motion whose knots may move (low, high, speed, after) and every number of the file that may change
 (low, high), [targets.NAME] (channel, value, tolerance, at) and [limits.NAME] (channel, low, high,
 since, until). With [uncertain."NUMBER"] (low, high) the plan is made for draws of them; with
---answer, the file of an identification with `rig = "RIG.toml"`, for draws of what that leaves
-unknown. Writes the rig file that carries the plan out as motion.toml, with plan.json, and the
-run of that file as run.nc and run.png; the exit status is 1 where it does not keep a target or
-limit."""
+--answer, the file of an identification with `rig = "RIG.toml"`, for draws of its estimates.
+Writes the plan as motion.toml, a rig file, with plan.json, and the run of that file as run.nc and
+run.png. The exit status is 1 if this run misses a target or exceeds a limit."""
 
 
 def add_commands(commands: Any) -> None:
@@ -24,7 +23,7 @@ def add_commands(commands: Any) -> None:
     one = add_command(commands, "plan", plan, "find a motion that reaches a goal", PLAN)
     one.add_argument("rig", type=Path, metavar="RIG.toml", help="the rig")
     one.add_argument("goal", type=Path, metavar="GOAL.toml", help="the goal")
-    meaning = "draw what an identification of the rig leaves unknown"
+    meaning = "plan for draws of the estimates of an identification"
     one.add_argument("--answer", type=Path, metavar="ANSWER.json", help=meaning)
     add_out(one, "plan")
     add_progress(one)

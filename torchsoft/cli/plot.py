@@ -9,8 +9,8 @@ from torchsoft.cli.results import add_command, say
 PLOT = """\
 Draws a run that `torchsoft run` or Trajectory.save wrote: FILE.png, a dashboard of motions, contact
 forces with the friction cone, points that stick and slip, stress and energies. --html writes the
-interactive player, one file for any browser that needs no network; --pdf a camera-ready dashboard,
-as wide as a page or a column, with --only for some of its panels."""
+interactive player, one file for any browser that needs no network; --pdf a dashboard for print, as
+wide as a page or a column, with --only for some of its panels."""
 
 
 def add_commands(commands: Any) -> None:

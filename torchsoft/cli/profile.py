@@ -19,8 +19,8 @@ from torchsoft.cli.results import (
 PROFILE = """\
 How far may an estimate move before the data contradict it?
 
-Takes the DATA and the CONFIG.toml of an identification, and its answer. Holds one parameter at one
-value after the other, fits the others again, and finds the ends of its 95 % interval, also where
+Takes the DATA and the CONFIG.toml of an identification, and its answer. Holds one parameter at a
+series of values, fits the others again, and finds the ends of its 95 % interval, also where
 the likelihood is not Gaussian. Writes profile.json."""
 
 

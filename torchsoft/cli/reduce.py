@@ -10,14 +10,14 @@ LARGEST = 2.0
 """Rolling radius over the farthest point of the body that rolls."""
 
 REDUCE = """\
-Which sparse equations do saved runs of a rig obey?
+Which sparse equations describe saved runs of a rig?
 
 RUN.nc are runs of any rig with one body between two pads, written by `torchsoft run`: small waves
-about a settled grasp, sampled every 0.25 ms (docs: Reduced models). Terms are those of mechanics
-with the rolling radius --radius, or that of the first run; the loop of F_x is fitted from its
-set-point. The last run, or --held-out, is predicted and not fitted. Writes reduced.json: equations,
-coefficients, and the error of the prediction; the exit status is 1 where that is no better than a
-constant."""
+about a settled grasp, sampled every 0.25 ms (docs: Find a reduced model). Terms are those of
+mechanics with the rolling radius --radius, or that of the first run; the loop of F_x is fitted from
+its set-point. The last run, or --held-out, is predicted and not fitted. Writes reduced.json:
+equations, coefficients, and the error of the prediction. The exit status is 1 if the prediction is
+no better than a constant."""
 
 
 def add_commands(commands: Any) -> None:

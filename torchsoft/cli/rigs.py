@@ -17,22 +17,21 @@ from torchsoft.cli.results import (
 )
 
 RUN = """\
-Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and
-a video to a folder.
+Simulates the rig of a TOML file, and writes trajectory.nc, summary.json, figures and a video to a
+folder.
 
-The file is checked first, and a rig that makes no sense is not run. Interrupted, what was
-simulated until then is written."""
+The file is checked first, and a rig with errors is not run. After Ctrl-C the results so far are
+written."""
 
 CHECK = """\
-Reports what is wrong or dangerous in a rig file: bodies that overlap or that nothing carries, loops
+Reports errors and warnings for a rig file: bodies that overlap or that nothing carries, loops
 that cannot work, recordings that end early. It then runs the rig at a loose tolerance, and reports
-bodies that are lost, strains beyond linear elasticity, contacts that never touch, unstable loops
-and steps that are too long. The exit status is 2 where there is an error, and 0 where there are
-only warnings and notes."""
+lost bodies, strains beyond linear elasticity, contacts that never touch, unstable loops and long
+steps. The exit status is 2 if there is an error, and 0 if there are only warnings and notes."""
 
 INIT = """\
 Writes NAME.toml, a rig to start from: a disc between two pads, with the unit and the meaning of
-every number in a comment. A folder that is not there is made."""
+every number in a comment. Missing folders are created."""
 
 
 def add_commands(commands: Any) -> None:
@@ -40,7 +39,7 @@ def add_commands(commands: Any) -> None:
     one = add_command(commands, "run", run_rig, "simulate a rig file", RUN)
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
     add_out(one, "RIG", default=None)
-    one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
+    one.add_argument("--anyway", action="store_true", help="run in spite of errors of the check")
     add_progress(one)
     add_yes(one)
     one = add_command(commands, "check", check_rig, "report what is wrong in a rig file", CHECK)

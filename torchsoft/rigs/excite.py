@@ -77,7 +77,7 @@ CATALOGUE: Mapping[str, Excitation] = {
     "hard light jerks": Excitation(strokes(80e-3, 0.15), duration=1.3, depth=1e-4),
     "deep jerks": Excitation(strokes(40e-3, 0.1), duration=1.3),
 }
-"""Excitations by name, from gentle to hard; `docs/motions.md` ranks them."""
+"""Excitations by name, from gentle to hard."""
 
 
 def excite(

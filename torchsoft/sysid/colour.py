@@ -102,9 +102,9 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
             continue
         fitted = sum(float(np.sum(Q[part.rows] ** 2)) for part in mine)
         found = fit_noise([(part.t, part.raw) for part in mine], fitted)
-        p, tests = found.noise.order, len(channels) * max(len(found.scores) - 1, 1)
-        ratio = found.scores[0].deviance - found.scores[p].deviance
-        if p > 0 and (channel in declared or tests * stats.chi2.sf(ratio, p) < LEVEL):
+        p, tests = found.noise.order, len(channels) * found.orders
+        chance = tests * stats.chi2.sf(found.likelihood_ratio, max(p, 1))
+        if p > 0 and (channel in declared or chance < LEVEL):
             out[channel] = found._replace(noise=found.noise.at_least(1.0))
     return out
 

@@ -191,7 +191,7 @@ def estimate_findings(
     out = list[Finding]()
     for e in found:
         if not e.identifiable:
-            change = f"{e.relative_sd:.0%}" if e.relative_sd < 9 else "a factor of ten"
+            change = f"a factor of {min(1 + e.relative_sd, 10):.2g}"
             out.append(Finding("not-identifiable", "note", {"estimate": e.label, "change": change}))
         elif e.at_bound:
             other, value = held.get(e.name, ("", np.nan))

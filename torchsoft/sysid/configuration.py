@@ -75,7 +75,7 @@ class Column(Table):
     """A column of the data, by its heading."""
 
     of: Name | None = None
-    """channel or motion that the column holds; the heading itself if not given"""
+    """channel, motion or `t` that the column holds; the heading itself if not given"""
     unwrap: bool = False
     """true: remove jumps of an angle by a full turn"""
 

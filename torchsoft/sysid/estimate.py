@@ -2,10 +2,9 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field
 from scipy import stats
 
 from torchsoft.sysid.fit import Fit
@@ -23,9 +22,6 @@ spans a factor of seven."""
 NOTHING = 0.1
 """Part of the width of its bounds below which a parameter on a linear scale is next to zero, where
 its interval may be wider than itself."""
-
-Seen = Annotated[bool, Field(alias="seen")]
-"""Whether the data determine it; called `seen` in files since their first version."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +42,7 @@ class Estimate:
     ci95: tuple[float, float] | None
     relative_sd: Number
     last: float
-    identifiable: Seen
+    identifiable: bool
     at_bound: bool
     step_bias_sd: Number
     kind: str = "parameter"
@@ -66,16 +62,6 @@ class Estimate:
             return f"not identifiable (the search ended at {self.last:.3g}{unit})"
         low, high = self.ci95
         return f"{self.value:.5g}{unit}, 95 % {low:.5g} to {high:.5g}"
-
-
-@dataclass(frozen=True)
-class Direction:
-    """An eigenvector of the Fisher matrix in the coordinates: its standard deviation and its
-    largest components by label."""
-
-    sd: float
-    identifiable: Seen
-    components: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -200,17 +186,6 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
         axis = one.name.split(".")[2]
         return ("rad" if axis.endswith("theta") else "m") + ("/s" if axis.startswith("v_") else "")
     return FAULTS[one.kind].unit.format(problem.unit(one.name))
-
-
-def directions(labels: list[str], values: Array, vectors: Array) -> list[Direction]:
-    """Eigenvectors of the Fisher matrix, the best determined first."""
-    out = []
-    for k in np.argsort(values)[::-1]:
-        sd = float(1.0 / np.sqrt(max(values[k], 1e-12)))
-        order = np.argsort(-np.abs(vectors[:, k]))
-        parts = {labels[i]: float(vectors[i, k]) for i in order if abs(vectors[i, k]) > 0.2}
-        out.append(Direction(sd, sd < IDENTIFIABLE, parts))
-    return out
 
 
 def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, float]]:

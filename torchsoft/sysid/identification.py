@@ -27,17 +27,12 @@ from torchsoft.sysid.conclusion import (
     run_findings,
     step_findings,
 )
-from torchsoft.sysid.estimate import directions, estimates, residual_channels
-from torchsoft.sysid.fit import FAR_OFF, Fit, Loss, Stage, Unreachable, fisher
+from torchsoft.sysid.estimate import estimates, residual_channels
+from torchsoft.sysid.fit import FAR_OFF, Fit, Loss, Stage, Unreachable
 from torchsoft.sysid.plan import FINER, default_plan, refine_steps, run_plan, shown
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.result import (
-    ChannelNoise,
-    IdentificationResult,
-    recorded_rigs,
-    seen_together,
-)
+from torchsoft.sysid.result import IdentificationResult, recorded_rigs, seen_together
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.search import coarsened
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
@@ -255,7 +250,7 @@ def concluded(
 ) -> IdentificationResult:
     """The answer at the end of a fit."""
     problem = end.problem
-    C, (C_free, values, vectors) = full_covariance(end, residuals, checked), fisher(end.J)
+    C = full_covariance(end, residuals, checked)
     shift = np.zeros(len(end.x)) if end.check.bias is None else end.check.bias
     found, channels = estimates(end, C, shift), residual_channels(end)
     errors, findings = predicted(end, heldout)
@@ -267,8 +262,7 @@ def concluded(
         estimates=found,
         labels=[*end.labels],
         x=[float(v) for v in end.x],
-        correlation=(C_free / np.outer(end.sd, end.sd)).tolist(),
-        directions=directions([*end.labels], values, vectors),
+        correlation=(end.covariance / np.outer(end.sd, end.sd)).tolist(),
         chi2=residuals.chi2,
         chi2_whitened=residuals.chi2_whitened,
         converged=end.converged,
@@ -296,10 +290,7 @@ def described(end: Fit) -> dict[str, Any]:
             replace(one, fixed=not is_free)
             for one, is_free in zip(problem.coordinates.all, end.free)
         ],
-        "noise": [
-            ChannelNoise(name, model, [*end.colour[name].scores] if name in end.colour else [])
-            for name, model in problem.noise.items()
-        ],
+        "noise": dict(problem.noise),
         "versions": {"python": platform.python_version()} | {one: version(one) for one in PACKAGES},
         "rigs": {recording.name: recording.rig for recording in problem.recordings},
     }

@@ -203,21 +203,13 @@ def log_det(W: sparse.csr_array) -> float:
     return -2 * float(np.log(W.diagonal()).sum())
 
 
-@dataclass(frozen=True)
-class Score:
-    """One order of a fit: -2 log likelihood of all samples, and the Bayesian information
-    criterion."""
-
-    order: int
-    deviance: float
-    bic: float
-
-
 class NoiseFit(NamedTuple):
-    """The selected noise, and the scores of all orders."""
+    """The selected noise, -2 log likelihood of white noise less that of this one, and the number of
+    the other orders that were compared with white noise."""
 
     noise: Autoregression
-    scores: tuple[Score, ...]
+    likelihood_ratio: float
+    orders: int
 
 
 def fit_noise(
@@ -241,14 +233,15 @@ def fit_noise(
         candidates = [tuple(coefficients(found[:p])) for p in range(len(found) + 1)]
     else:
         candidates = [(), (by_time(series, h),)]
-    out, scores = [], []
+    out, deviances = list[Autoregression](), list[float]()
     for phi in candidates:
         square, log = whitened_sum(Autoregression(phi, 1.0, h), series)
         scale = max(square / max(m - parameters, 1.0), 1e-300) ** 0.5
-        deviance = 2 * m * np.log(scale) + log + square / scale**2
+        deviances.append(2 * m * np.log(scale) + log + square / scale**2)
         out.append(Autoregression(phi, scale, h))
-        scores.append(Score(len(phi), deviance, deviance + (len(phi) + 1) * np.log(m)))
-    return NoiseFit(out[int(np.argmin([score.bic for score in scores]))], tuple(scores))
+    bic = np.array(deviances) + np.log(m) * np.array([one.order + 1 for one in out])
+    best = int(np.argmin(bic))
+    return NoiseFit(out[best], deviances[0] - deviances[best], len(out) - 1)
 
 
 def whitened_sum(

@@ -33,7 +33,7 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import unjudged
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.initial_state import PREFIX, reference_from
-from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choice, predict, prepared
+from torchsoft.sysid.prediction import Frozen, Prediction, Steps, choice, predict, prepared
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Mask, Recording, RunContext
 from torchsoft.sysid.runs import Runner
@@ -124,7 +124,7 @@ class DesignEvaluation(NamedTuple):
     """One motion: the criterion, the penalty `cost` of excess, the largest fraction of their limits
     that channels reach, the relative standard `deviations` of the parameters (s,), their `errors`
     (k, s) by nonlinear samples, the criterion's derivative G (n, n) by the Fisher matrix, the rows
-    J (m, n) of the samples, the steps, and the signals of the run."""
+    J (m, n) of the samples, the steps, and the run."""
 
     value: float
     cost: float
@@ -134,7 +134,7 @@ class DesignEvaluation(NamedTuple):
     G: Array
     J: Array
     steps: Frozen
-    signals: Signals
+    run: Prediction
 
 
 class Planner:
@@ -209,14 +209,13 @@ class Planner:
         C, T = np.zeros((len(self.x), len(self.x))), self.T
         every = np.concatenate((self.recorded, at.J))[:, self.free]
         C[np.ix_(self.free, self.free)] = fisher(every)[0]
-        signals = Signals(run.t, self.recording.channels, run.signals, None)
-        self.check_predictable(at.J, signals)
+        self.check_predictable(at.J, run)
         errors = self.errors(z, at, C) if steps is None else np.zeros((1, len(T)))
         spread = T @ C @ T.T
         deviations = dict(zip(self.names, np.sqrt(np.diag(spread)).tolist()))
         spread += LEFT**2 * errors.T @ errors / len(errors)
         value, S = optimality(self.criterion, spread)
-        reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
+        reached = {name: np.abs(part) for name, part in self.reached(run).items()}
         excess = [np.maximum(part - MARGIN, 0.0) for part in reached.values()]
         return DesignEvaluation(
             value,
@@ -227,24 +226,24 @@ class Planner:
             -C @ T.T @ S @ T @ C,
             at.J[: len(at.J) - len(self.problem.coordinates.priors)],
             at.steps[self.recording.name],
-            signals,
+            run,
         )
 
-    def check_predictable(self, J: Array, signals: Signals) -> None:
+    def check_predictable(self, J: Array, run: Prediction) -> None:
         """Raises `SimulationFailed` where a small change of a parameter would change the samples
         completely: their information is then that of chaos, which no fit can use."""
         c, at = self.problem.coordinates, 0
         rig = [one.of_the_rig and one.scale == "log" for one in c.all]
         for channel, one in self.problem.readouts(self.x, self.k).items():
             t, _ = self.recording.samples[channel]
-            most = np.abs(one.expected(signals, t)[0]).max() / self.problem.sensors[channel].noise
+            most = np.abs(one.expected(run, t)[0]).max() / self.problem.sensors[channel].noise
             of = np.abs(J[at : at + len(t)]).max(0) * rig / max(most, 1.0)
             if of.max() > PREDICTABLE:
                 raise SimulationFailed(
                     f"a change of `{c.labels[int(of.argmax())]}` by 1 % would change `{channel}` "
                     f"by {of.max():.0f} % of its largest value: nothing that follows from it can "
                     "be predicted",
-                    float(signals.t[-1]),
+                    float(run.t[-1]),
                 )
             at += len(t)
 
@@ -262,11 +261,12 @@ class Planner:
             out.append(T @ C @ at.J.T @ (there.r - at.r - at.J @ off))
         return np.array(out)
 
-    def reached(self, signals: Signals) -> dict[str, Array]:
+    def reached(self, run: Prediction) -> dict[str, Array]:
         """Position of limited channels (G,) within their ranges: 0 in the middle, -1 and 1 at the
         ends."""
+        column = self.recording.channels.index
         return {
-            name: (2 * signals.values[:, signals.names.index(name)] - low - high) / (high - low)
+            name: (2 * run.signals[:, column(name)] - low - high) / (high - low)
             for name, (low, high) in self.limits.items()
         }
 
@@ -274,16 +274,16 @@ class Planner:
         """Gradient by z of the criterion and of the penalty, on the steps of the evaluation. Raises
         `SimulationFailed`."""
         c, x, W, tasks = self.problem.coordinates, self.x, 2 * at.J @ at.G, []
-        (low, high), here = c.bounds, self.overload(at.signals)  # weights on the signals at x
+        (low, high), here = c.bounds, self.overload(at.run)  # weights on the signals at x
         for j in np.flatnonzero(self.free & (np.abs(at.J).max(0) > 0)):
             ahead, behind = x.copy(), x.copy()
             ahead[j], behind[j] = min(x[j] + DIFFERENCE, high[j]), max(x[j] - DIFFERENCE, low[j])
             w = W[:, j] / (ahead[j] - behind[j])
             if c.all[j].of_the_rig:
-                weights = self.pulled(x, at.signals, w)
+                weights = self.pulled(x, at.run, w)
                 tasks += [(ahead, weights), (behind, -weights)]
             else:  # the run is the same, only what a sensor makes of it is not
-                here += self.pulled(ahead, at.signals, w) - self.pulled(behind, at.signals, w)
+                here += self.pulled(ahead, at.run, w) - self.pulled(behind, at.run, w)
         if here.any():
             tasks.append((x, here))
 
@@ -315,25 +315,25 @@ class Planner:
         self.cost["gradients"] += 1
         return slopes.numpy()
 
-    def pulled(self, x: Array, signals: Signals, w: Array) -> Array:
+    def pulled(self, x: Array, run: Prediction, w: Array) -> Array:
         """Weights (G, channels) on the signals, from weights w (m,) on the residuals."""
-        out, at = np.zeros(signals.values.shape), 0
+        out, at = np.zeros(run.signals.shape), 0
         for channel, one in self.problem.readouts(x, self.k).items():
             t, measured = self.recording.samples[channel]
-            _, weight = one.residuals(one.expected(signals, t)[0], measured)
+            _, weight = one.residuals(one.expected(run, t)[0], measured)
             v, noise = w[at : at + len(t)], self.problem.noise.get(channel)
             v = v if noise is None else noise.whitener(t).T @ v
-            out += one.pulled_back(signals, t, weight * v)
+            out += one.pulled_back(run, t, weight * v)
             at += len(t)
         return out
 
-    def overload(self, signals: Signals) -> Array:
+    def overload(self, run: Prediction) -> Array:
         """Derivative of the penalty by the signals (G, channels)."""
-        out = np.zeros(signals.values.shape)
-        for name, part in self.reached(signals).items():
+        out, column = np.zeros(run.signals.shape), self.recording.channels.index
+        for name, part in self.reached(run).items():
             low, high = self.limits[name]
             excess = np.maximum(np.abs(part) - MARGIN, 0.0) * np.sign(part)
-            out[:, signals.names.index(name)] = 4 * PRICE * excess / (high - low)
+            out[:, column(name)] = 4 * PRICE * excess / (high - low)
         return out
 
     def made(self, z: Array, at: DesignEvaluation) -> Recording:
@@ -343,5 +343,5 @@ class Planner:
             rig.reference = self.moves.reference(torch.from_numpy(z))
         for channel, one in self.problem.readouts(self.x, self.k).items():
             t, _ = self.recording.samples[channel]
-            samples[channel] = t, one.expected(at.signals, t)[0]
+            samples[channel] = t, one.expected(at.run, t)[0]
         return replace(self.recording, rig=rig, samples=samples)

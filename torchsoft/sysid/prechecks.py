@@ -21,7 +21,7 @@ from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.plan import LOOSE
-from torchsoft.sysid.prediction import Prediction, Readout, Signals
+from torchsoft.sysid.prediction import Prediction, Readout
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Runner
@@ -29,8 +29,8 @@ from torchsoft.sysid.sentences import Finding
 from torchsoft.sysid.unknowns import Sensor
 from torchsoft.tables import shown
 
-Expected = Mapping[str, tuple[Readout, Signals]]
-"""Readouts of a run, with its signals, by channel."""
+Expected = Mapping[str, tuple[Readout, Prediction]]
+"""Readouts of a run, with the run, by channel."""
 
 
 def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
@@ -44,9 +44,8 @@ def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = Non
     for job, run in zip(jobs, runs):
         recording, expected = problem.recordings[job.recording], {}
         if isinstance(run, Prediction):
-            signals = Signals(run.t, recording.channels, run.signals, None)
             readouts = problem.readouts(x, job.recording)
-            expected = {name: (one, signals) for name, one in readouts.items()}
+            expected = {name: (one, run) for name, one in readouts.items()}
         every += findings(recording, problem.sensors, expected, unknown)
     return together(every)
 
@@ -338,11 +337,11 @@ def run_findings(
     recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
 ) -> Iterator[Finding]:
     """Findings on channels whose sign or unit contradicts the run."""
-    for name, (one, signals) in expected.items():
+    for name, (one, predicted) in expected.items():
         (t, y), least = unsaturated(recording, sensors[name], name), MOVES * sensors[name].sd
         if len(t) < 2 * MOVES:
             continue
-        p = one.expected(signals, t)[0]
+        p = one.expected(predicted, t)[0]
         measured, run = float(np.std(y)), float(np.std(p))
         ratio = measured / max(run, 1e-300)
         if max(measured, run) < least:

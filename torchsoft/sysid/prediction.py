@@ -21,25 +21,34 @@ from torchsoft.solve.gradients import directions
 from torchsoft.solve.simulate import unjudged
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.sysid.initial_state import PREFIX, reference_from
-from torchsoft.sysid.recording import REACH, Array, Grid, RunContext
+from torchsoft.sysid.recording import REACH, Array, Grid, Recording, RunContext
 from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
 
 
-class Signals(NamedTuple):
-    """Channels of a run on a grid: t (G,) [s], values (G, channels) in the order of `names`, and
-    their derivatives (G, channels, n), if any."""
+class Prediction(NamedTuple):
+    """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], their derivatives (G,
+    channels, n), if any, and the ends `knots` [s] of steps chosen by a tolerance; `step` is the
+    expected time of a step [s] in a run of a changed recording, 0 for one as stated."""
 
     t: Array
-    names: tuple[str, ...]
-    values: Array
-    derivatives: Array | None
+    signals: Array
+    derivatives: Array | None = None
+    knots: Array | None = None
+    step: float = 0.0
+
+
+class FailedRun(NamedTuple):
+    """A failed run: reason and time [s]."""
+
+    reason: str
+    time: float
 
 
 class Term(NamedTuple):
-    """A term of a reading: `factor` times the derivative of some `order` of a channel, and the
-    derivative of the factor by a nuisance."""
+    """A term of a reading: `factor` times the derivative of some `order` of a channel, which is a
+    `column` of the signals, and the derivative of the factor by a nuisance."""
 
-    channel: str
+    column: int
     order: int
     factor: float
     by: tuple[Nuisance, float] | None = None
@@ -64,27 +73,27 @@ class Readout:
     lag: float = 0.0
     backlash: float = 0.0
 
-    def quantity(self, signals: Signals, values: Array) -> Array:
-        """The measured quantity (G, ...) on the grid, from values (G, channels, ...)."""
+    def quantity(self, t: Array, signals: Array) -> Array:
+        """The measured quantity (G, ...) at times t (G,) [s], from signals (G, channels, ...)."""
         parts = [
-            one.factor * slope(signals.t, values[:, signals.names.index(one.channel)], one.order)
+            one.factor * slope(t, signals[:, one.column], one.order)
             for one in self.terms
             if one.factor != 0.0
         ]
         return np.sum(parts, 0)
 
     def expected(
-        self, signals: Signals, times: Array
+        self, run: Prediction, times: Array
     ) -> tuple[Array, Array | None, dict[Nuisance, Array]]:
-        """Noiseless reading (k,) at `times`, its derivatives (k, n) by the parameters of the run's
-        sensitivities, and those by the nuisances; by no backlash it is the secant to one as large
-        as the noise."""
-        y, later = self.quantity(signals, signals.values), times - self.middle
+        """Noiseless reading (k,) of a run at `times`, its derivatives (k, n) by the parameters of
+        the run's sensitivities, and those by the nuisances; by no backlash it is the secant to one
+        as large as the noise."""
+        y, later = self.quantity(run.t, run.signals), times - self.middle
         source, side = taken_up(y, self.backlash)
         held, slopes = y[source] - 0.5 * self.backlash * side, None
 
         def curves(columns: Array, lag: float) -> CubicSpline:
-            return CubicSpline(signals.t, lagged(signals.t, columns, lag))
+            return CubicSpline(run.t, lagged(run.t, columns, lag))
 
         def behind(columns: Array, lag: float = self.lag) -> Array:
             return curves(columns, lag)(self.own_times(times))
@@ -96,7 +105,7 @@ class Readout:
             by_lag = (more - less) / (2 * LAG_STEP * self.lag)
         by: dict[Nuisance, Array] = {
             kind: self.gain * behind(column)
-            for kind, column in self._by_signals(signals, y, source, side).items()
+            for kind, column in self._by_signals(run, y, source, side).items()
         }
         seen = behind(held)
         by |= {
@@ -107,12 +116,12 @@ class Readout:
             "clock": -self.gain * rate * later,
             "lag": self.gain * by_lag,
         }
-        if signals.derivatives is not None:
-            slopes = self.gain * behind(self.quantity(signals, signals.derivatives)[source])
+        if run.derivatives is not None:
+            slopes = self.gain * behind(self.quantity(run.t, run.derivatives)[source])
         return self.gain * seen + self.bias + self.drift * later, slopes, by
 
     def _by_signals(
-        self, signals: Signals, y: Array, source: NDArray[np.intp], side: Array
+        self, run: Prediction, y: Array, source: NDArray[np.intp], side: Array
     ) -> dict[Nuisance, Array]:
         """Derivatives (G,) of the quantity y (G,) with backlash by the nuisances that act on the
         grid."""
@@ -123,8 +132,8 @@ class Readout:
         for one in self.terms:
             if one.by is not None:
                 kind, factor = one.by
-                values = signals.values[:, signals.names.index(one.channel)]
-                by[kind] = by.get(kind, 0.0) + factor * slope(signals.t, values, one.order)[source]
+                rise = slope(run.t, run.signals[:, one.column], one.order)
+                by[kind] = by.get(kind, 0.0) + factor * rise[source]
         return by
 
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
@@ -142,17 +151,17 @@ class Readout:
                 r[at], weight[at] = sign * beyond, slope / self.noise
         return r, weight
 
-    def pulled_back(self, signals: Signals, times: Array, v: Array) -> Array:
+    def pulled_back(self, run: Prediction, times: Array, v: Array) -> Array:
         """Weights (G, channels) on the channels, from weights v (k,) on the expected reading."""
-        t, held = signals.t, np.zeros(len(signals.t))
-        source, _ = taken_up(self.quantity(signals, signals.values), self.backlash)
+        t, held = run.t, np.zeros(len(run.t))
+        source, _ = taken_up(self.quantity(t, run.signals), self.backlash)
         curves = CubicSpline(t, lagged(t, np.eye(len(t)), self.lag))
         np.add.at(held, source, self.gain * (v @ curves(self.own_times(times))))
-        out = np.zeros(signals.values.shape)
+        out = np.zeros(run.signals.shape)
         for one in self.terms:
             if one.factor != 0.0:
                 back = held @ slope(t, np.eye(len(t)), one.order)
-                out[:, signals.names.index(one.channel)] += one.factor * back
+                out[:, one.column] += one.factor * back
         return out
 
     def own_times(self, times: Array) -> Array:
@@ -243,31 +252,29 @@ def pushed(rig: Rig, channel: str) -> str:
 
 
 def readout(
-    rig: Rig,
-    channel: str,
-    sensor: Sensor,
-    values: Mapping[Nuisance, float],
-    span: tuple[float, float],
+    recording: Recording, channel: str, sensor: Sensor, values: Mapping[Nuisance, float]
 ) -> Readout:
-    """The readout of a sensor with the nuisances' `values`, in a recording over the times `span`
-    [s]. Raises `ValueError` for a nuisance that the channel cannot have."""
+    """The readout of a sensor with the nuisances' `values` in a recording. Raises `ValueError` for
+    a nuisance that the channel cannot have."""
+    rig, column = recording.rig, recording.channels.index
+    first, last = float(recording.times[0]), float(recording.times[-1])
     at = {kind: values.get(kind, float(kind == "gain")) for kind in NUISANCES}
     c, s = np.cos(at["misalignment"]), np.sin(at["misalignment"])
     if sensor.misalignment > 0:
         other, sign = partner(rig, channel)
         terms = [
-            Term(channel, 0, float(c), ("misalignment", -float(s))),
-            Term(other, 0, float(sign * s), ("misalignment", float(sign * c))),
+            Term(column(channel), 0, float(c), ("misalignment", -float(s))),
+            Term(column(other), 0, float(sign * s), ("misalignment", float(sign * c))),
         ]
     else:
-        terms = [Term(channel, 0, 1.0)]
-    if sensor.clock * 0.5 * (span[1] - span[0]) + sensor.delay > REACH:
+        terms = [Term(column(channel), 0, 1.0)]
+    if sensor.clock * 0.5 * (last - first) + sensor.delay > REACH:
         raise ValueError(
             f"sensors.{channel}.clock = {sensor.clock:g} is more than {REACH:g} s at the ends of a "
-            f"recording of {span[1] - span[0]:g} s, with its delay; take less"
+            f"recording of {last - first:g} s, with its delay; take less"
         )
     if sensor.inertia > 0:
-        terms.append(Term(pushed(rig, channel), 1, -at["inertia"], ("inertia", -1.0)))
+        terms.append(Term(column(pushed(rig, channel)), 1, -at["inertia"], ("inertia", -1.0)))
     return Readout(
         channel,
         sensor.sd,
@@ -277,7 +284,7 @@ def readout(
         at["bias"],
         at["drift"],
         at["delay"],
-        0.5 * (span[0] + span[1]),
+        0.5 * (first + last),
         tuple(terms),
         at["clock"],
         at["lag"],
@@ -306,25 +313,6 @@ class Frozen:
 
 Steps = float | Frozen
 """Steps of a run: a relative tolerance that chooses them, or frozen ones."""
-
-
-class Prediction(NamedTuple):
-    """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], their derivatives (G,
-    channels, n), if any, and the ends `knots` [s] of steps chosen by a tolerance; `step` is the
-    expected time of a step [s] in a run of a changed recording, 0 for one as stated."""
-
-    t: Array
-    signals: Array
-    derivatives: Array | None = None
-    knots: Array | None = None
-    step: float = 0.0
-
-
-class FailedRun(NamedTuple):
-    """A failed run: reason and time [s]."""
-
-    reason: str
-    time: float
 
 
 @torch.no_grad()

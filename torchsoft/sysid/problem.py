@@ -19,7 +19,6 @@ from torchsoft.sysid.prediction import (
     Frozen,
     Prediction,
     Readout,
-    Signals,
     readout,
     set_parameters,
 )
@@ -291,11 +290,10 @@ class Problem(Shown):
     def readouts(self, x: Array, k: int) -> dict[str, Readout]:
         """Readouts of the sensors with samples in recording k, at x (n,)."""
         recording, out = self.recordings[k], {}
-        span = float(recording.times[0]), float(recording.times[-1])
         for _, channel, sensor in self.measured([recording.name]):
             at = self.coordinates.nuisances(x, channel, recording.name)
             values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
-            out[channel] = readout(recording.rig, channel, sensor, values, span)
+            out[channel] = readout(recording, channel, sensor, values)
         return out
 
     def unit(self, channel: str) -> str:
@@ -399,11 +397,10 @@ class Problem(Shown):
 
     def readings(self, x: Array, job: Job, run: Prediction) -> Iterator[Reading]:
         """Readings of the sensors in a job's recording at x (n,)."""
-        recording, samples = self.recordings[job.recording], self.samples_at(x, job.recording)
-        signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
+        samples = self.samples_at(x, job.recording)
         for channel, one in self.readouts(x, job.recording).items():
             t, measured = samples[channel]
-            y, slopes, by = one.expected(signals, t)
+            y, slopes, by = one.expected(run, t)
             yield Reading(channel, t, measured, y, slopes, by, *one.residuals(y, measured))
 
     def log_density(

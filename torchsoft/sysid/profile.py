@@ -43,7 +43,7 @@ def optimum(problem: Problem, answer: IdentificationResult, workers: int = 1) ->
             "no posterior; identify with loss = 'linear'"
         )
     if answer.noise:
-        problem = problem.with_noise({one.channel: one.model for one in answer.noise})
+        problem = problem.with_noise(answer.noise)
     stage = Stage("optimum", tuple(last["recordings"]), tuple(last["free"]), last["rtol"])
     runner, variance = Runner(problem.recordings, workers), max(1.0, answer.chi2_whitened)
     return Fit(problem, runner, np.array(answer.x), stage, variance=variance).evaluated()

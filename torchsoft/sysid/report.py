@@ -168,10 +168,11 @@ def correlations(result: IdentificationResult) -> str:
 
 
 def assumptions(result: IdentificationResult) -> tuple[list[list[str]], list[list[str]]]:
-    """Rows on the tests of assumptions, with those apart that matter neither to the estimates nor
-    to the data."""
+    """Rows on the tests of assumptions, suspects first, with those apart that matter neither to the
+    estimates nor to the data."""
     moving, harmless = list[list[str]](), list[list[str]]()
-    for one in sorted(result.assumptions, key=lambda one: -abs(one.most_moved[1])):
+    order = sorted(result.assumptions, key=lambda one: (-one.score, -abs(one.most_moved[1])))
+    for one in order:
         label, move = one.most_moved
         favoured, seen, measurable = "", "", one.has_amount
         if np.isfinite(one.favoured_sd) and not one.unchecked:
@@ -224,8 +225,9 @@ def recordings(result: IdentificationResult) -> list[list[str]]:
 def residuals(result: IdentificationResult) -> list[list[str]]:
     """Rows on the residuals of what was fitted, with the order and the standard deviation of the
     noise."""
-    known = {one.channel: one.model for one in result.noise}
-    noise = {name: f"order {one.order}, {one.sd:.2g} × as stated" for name, one in known.items()}
+    noise = {
+        name: f"order {one.order}, {one.sd:.2g} × as stated" for name, one in result.noise.items()
+    }
     out = []
     for one in result.residuals:
         row = [one.recording, one.channel, f"{one.rms:.2f}", grouped(one.lag1, 2)]

@@ -27,14 +27,10 @@ from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.written import files_renamed
 from torchsoft.sysid.assumption_tests import AssumptionTest
-from torchsoft.sysid.estimate import (
-    ChannelResiduals,
-    Direction,
-    Estimate,
-)
+from torchsoft.sysid.estimate import ChannelResiduals, Estimate
 from torchsoft.sysid.fit import Combination, Fit, combinations
 from torchsoft.sysid.initial_state import PREFIX
-from torchsoft.sysid.noise import Autoregression, Score
+from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.sentences import HEADLINES, IDENTIFIED, Finding
@@ -136,7 +132,7 @@ def recorded_rigs(fit: Fit) -> list[RecordedRig]:
 # The result
 
 
-SCHEMA = "torchsoft-answer-9"
+SCHEMA = "torchsoft-answer-10"
 """Name and version of the file format."""
 
 
@@ -146,23 +142,13 @@ LARGEST = 1e9
 Verdict = Literal["holds", "doubtful", "does not explain"]
 
 
-@dataclass(frozen=True)
-class ChannelNoise:
-    """Coloured noise of one channel: the model that whitened its residuals, and the scores of all
-    orders."""
-
-    channel: str
-    model: Autoregression
-    tried: list[Score]
-
-
 @dataclass(frozen=True, repr=False)
 class IdentificationResult(Shown):
-    """Estimates, correlations, directions, residuals, predictions, and their provenance.
+    """Estimates, correlations, residuals, predictions, and their provenance.
 
-    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in the free ones
-    (`labels`). `rigs` are those of the recordings, with their laws and references; a file does not
-    hold them.
+    `x` and `covariance` are in `coordinates`, `correlation` in the free ones (`labels`). `noise` is
+    the colour by channel that whitened residuals. `rigs` are those of the recordings, with their
+    laws and references; a file does not hold them.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
@@ -171,7 +157,6 @@ class IdentificationResult(Shown):
     labels: list[str]
     x: list[float]
     correlation: list[list[Number]]
-    directions: list[Direction]
     # sum of squared residuals over the stated noise, per degree of freedom: 1 where both are right
     chi2: Number
     # the same of residuals whitened by the colour that was found, with those of the priors
@@ -191,7 +176,7 @@ class IdentificationResult(Shown):
     sensors: dict[str, Sensor] = field(default_factory=dict, repr=False)
     coordinates: list[Coordinate] = field(default_factory=list, repr=False)
     combinations: list[Combination] = field(default_factory=list, repr=False)
-    noise: list[ChannelNoise] = field(default_factory=list, repr=False)
+    noise: dict[str, Autoregression] = field(default_factory=dict, repr=False)
     assumptions: list[AssumptionTest] = field(default_factory=list, repr=False)
     versions: dict[str, str] = field(default_factory=dict, repr=False)
     command: str = ""
@@ -350,7 +335,7 @@ class IdentificationResult(Shown):
     def to_json(self) -> str:
         """Content of the file."""
         content = {"verdict": self.verdict}
-        content |= finite(adapter().dump_python(self, mode="json", by_alias=True))
+        content |= finite(adapter().dump_python(self, mode="json"))
         for one, finding in zip(content["findings"], self.findings):
             one["text"] = str(finding)
         return json.dumps(

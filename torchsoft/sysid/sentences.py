@@ -106,7 +106,7 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "Take rtol = {finer:g}.",
     ),
     "steps-not-refined": (
-        "Steps were checked and not refined, since chi2 = {chi2:.3g} is far above the noise.",
+        "Time steps were checked but not refined, since chi2 = {chi2:.3g} is far above the noise.",
     ),
     "noisy-derivatives": (
         "The tolerance rtol = {rtol:g} is too coarse for derivatives: their error is {error:.2g} "
@@ -186,12 +186,12 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "The interval does not allow for that: refine {setting}.",
     ),
     "undetectable": (
-        "The largest undetectable shift is {shift:.2g} standard deviations of {estimate}: {name} "
-        "may differ by {size} from its stated value, and the data would not show it.",
+        "The largest undetectable shift is {shift:.2g} standard deviations of {estimate}.",
+        "It occurs if {name} differs by {size} from what is stated ({stated}).",
     ),
     "untestable": (
-        "{estimate} depends on {name}, which no residual can test: {size} of it is {shift:.2g} "
-        "standard deviations.",
+        "{estimate} depends on {name}, which these data cannot test: an error of {size} shifts it "
+        "by {shift:.2g} standard deviations.",
     ),
     "undetectable-others": (
         "{count} more would shift an estimate by up to {shift:.2g} standard deviations without "
@@ -202,10 +202,12 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "That may be chance: {tested} assumptions were tested.",
     ),
     "cause": (
-        "The data contradict that {stated}: the sum of squares falls by {gain:.0f} with {cases}.",
+        "The data contradict that {stated}: the sum of squares falls from {before:.4g} to "
+        "{left:.4g} with {cases}.",
         "{estimate} would move by {shift:.2g} standard deviations; estimates under it: {under}.",
         "The refit with {unconverged} free has not converged, so it has no estimates.",
-        "Correct it, or make it an unknown, and identify again.",
+        "Correct it, and identify again.",
+        'To estimate it, add [unknowns."{unknown}"].',
     ),
     "causes": (
         "The data contradict one of {count} assumptions, and cannot tell which: {cases}.",
@@ -248,8 +250,9 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         EXPLAIN,
     ),
     "none": (
-        "None of the {count} refitted suspects explains the misfit.",
+        "{count} of {total} suspects were refitted, and none explains the misfit.",
         "Residuals still fail a test ({alarms}).",
+        "Look at their plots in the report: the cause may not be among the suspects.",
     ),
     # profiles
     "profile-open": (
@@ -322,7 +325,7 @@ CASES: dict[str, tuple[str, ...]] = {
         "{channel}",
         " (order {order}, neighbouring samples correlate by {correlation:.2f})",
     ),
-    "alarms": ("{test}", " in {channel} of `{recording}`"),
+    "alarms": ("{test}", " in {channel} of `{recording}`", " in {samples:.0f} samples together"),
     "no-suspect": ("{name}", " ({part:.0%} of the misfit)"),
     "causes": (*SUSPECT, ", score {score:.2g}"),
     "law": ("`{other}` is behind by {evidence:.3g} nats, {z:.2g} standard deviations",),
@@ -333,8 +336,8 @@ CASES |= {"smaller": CASES["larger"]}
 HEADLINES = {
     "holds": "The model holds. {identified}",
     "doubtful": "The model is doubtful: see the warnings below. If it holds: {identified}",
-    "does not explain": "The model does not explain the data: see the errors below. Intervals may "
-    "miss the truth. χ² = {chi2:.3g}",
+    "does not explain": "The model does not explain the data: see the findings below. Intervals "
+    "may miss the truth. χ² = {chi2:.3g}",
 }
 """First line of a report by its verdict."""
 

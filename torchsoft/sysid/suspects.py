@@ -63,7 +63,8 @@ def suspect_findings(checked: Checked, unexplained: Severity) -> list[Finding]:
 def cause(best: AssumptionTest) -> Finding:
     """The finding of one cause."""
     estimate, shift = best.shift
-    facts: dict[str, Any] = {"cases": [best.case], "gain": best.gain, "stated": best.stated}
+    facts: dict[str, Any] = {"cases": [best.case], "stated": best.stated, "left": best.left}
+    facts |= {"before": best.left + best.gain, "unknown": best.parameter}
     if best.under:
         under = dict(list(best.under.items())[:UNDER])
         facts |= {"estimate": estimate, "shift": abs(shift), "under": under}
@@ -88,7 +89,8 @@ def without_suspect(checked: Checked, severity: Severity) -> list[Finding]:
         cases = [{"name": one.name, "part": one.gain / square} for one in nearest]
         return [Finding("no-suspect", severity, {"cases": cases})]
     if checked.fails_best:
-        facts = {"count": len(refitted), "alarms": alarms_of(checked)}
+        facts = {"count": len(refitted), "total": len(checked.checks)}
+        facts |= {"alarms": alarms_of(checked)}
         return [Finding("none", severity, facts)]
     return []
 
@@ -159,4 +161,5 @@ def risk_findings(checked: Checked) -> list[Finding]:
 def risk(code: str, one: AssumptionTest, estimate: str, shift: float, size: float) -> Finding:
     """A note that an amount of an assumption shifts an estimate by so many standard deviations."""
     facts: dict[str, Any] = {"estimate": estimate, "shift": abs(shift), "name": one.name}
+    facts |= {"stated": one.stated}
     return Finding(code, "note", facts | {"size": f"{size:.2g} {one.unit}".strip()})
