@@ -101,7 +101,7 @@ class Model:
     widths: numbers of an output: of the state, of integrals, forces and rates of nodal pads
     nodal_widths: numbers of rates of each nodal pad
     bytes: size of the kernels' arrays; no_tape: a tape for nothing
-    made_of: key of the structure, and geometry; shared: whether it may serve other runs
+    shared: whether it may serve other runs
     last, motion: vectors of parameters and signals of the last run, with what they were made of
 
     Raises the `ValueError`s of a rig that cannot be run, and warns of its laws' faults.
@@ -117,7 +117,8 @@ class Model:
         self.low, self.high = ranges(modules, structure)
         self.derived = derived(modules)
         self.judged = [i for i, one in enumerate(modules) if hasattr(one, "well_posed")]
-        self.made_of = structure.key, geometry(structure, values)
+        self._key, self._geometric = structure.key, geometric(structure)
+        self._geometry = self._geometry_of(values)
         shapes, matched = prepared(rig)
         made = computed(rig, shapes, matched)
         laws = compiled_laws(rig, made, shapes, matched)
@@ -156,6 +157,13 @@ class Model:
         self._idle: list[Room] = []
         self.last: tuple[Array, Tensor, Tensor, dict[str, float]] | None = None
         self.motion: tuple[Any, Followed] | None = None
+
+    def _geometry_of(self, values: Sequence[Tensor]) -> bytes:
+        return b"".join([values[i].detach().numpy().tobytes() for i in self._geometric])
+
+    def serves(self, structure: Structure, values: Sequence[Tensor]) -> bool:
+        """Whether this is the model of a rig with these parameters."""
+        return structure.key == self._key and self._geometry == self._geometry_of(values)
 
     def within(self, modules: Sequence[Any], theta: Array) -> bool:
         """Whether the values of a rig's parameters, theta, are physical; its own checks are to say
@@ -272,14 +280,14 @@ def derived(modules: Sequence[Any]) -> list[tuple[int, str, float, float]]:
     return out
 
 
-def geometry(structure: Structure, values: Sequence[Tensor]) -> bytes:
-    """Values of the parameters that the arrays of a model depend on: those of shapes, and Poisson's
+def geometric(structure: Structure) -> list[int]:
+    """Which of the parameters the arrays of a model depend on: those of shapes, and Poisson's
     ratios."""
     owners = [(m, k) for m in structure.modules for k, x in m._parameters.items() if x is not None]
-    return b"".join([
-        value.detach().numpy().tobytes() for (module, name), value in zip(owners, values)
+    return [
+        i for i, (module, name) in enumerate(owners)
         if isinstance(module, Shape) or (isinstance(module, Material) and name == "nu")
-    ])  # fmt: skip
+    ]  # fmt: skip
 
 
 _kept: deque[Model] = deque(maxlen=KEPT)
@@ -288,10 +296,9 @@ _finding = threading.RLock()
 
 def model_of(structure: Structure, values: Sequence[Tensor]) -> Model:
     """The model of a rig with these parameters: one that is kept, or one that is made."""
-    key = structure.key, geometry(structure, values)
     with _finding:
         kept = _kept if structure.known else ()
-        found = next((one for one in kept if one.made_of == key), None)
+        found = next((one for one in kept if one.serves(structure, values)), None)
         if found is None:
             found = Model(structure, values)
         elif found is not _kept[0]:
