@@ -54,7 +54,6 @@ from torchsoft import (
     controller,
     simulate,
 )
-from torchsoft.physics.extensions import extend, extensions
 from torchsoft.physics.hyperelastic import Hyperelastic, invariants
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.motion import Lines, Waves, wave
@@ -62,6 +61,7 @@ from torchsoft.physics.statics import standing
 from torchsoft.solve.kernel.arrays import GAMMA
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.sysid.extensions import extend, extensions
 from torchsoft.testing import check_power
 
 MESH = PadMesh(60e-3, 4.59e-3, 30, 2)

@@ -9,9 +9,9 @@ import torch
 from conftest import COARSE, paper, rest, still, times
 
 from torchsoft import simulate
-from torchsoft.physics.extensions import extend, extensions
 from torchsoft.rigs.build import RigFile
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
+from torchsoft.sysid.extensions import extend, extensions
 
 MODEL = still(COARSE)
 POWER = "laws.steel_on_rubber.power"
