@@ -263,7 +263,7 @@ class SmoothSlip(Friction):
 
 
 class Coulomb(Friction):
-    """Stick up to mu_s F_N, then mu_k F_N (Eq. 12-13 with the force's modulus).
+    """Stick up to mu_s F_N, then mu_k F_N (Eqs. 12-13 of the paper with the force's modulus).
 
     The spring re-anchors so that the Voigt pair carries just mu_k F_N, |gamma'| = (E - mu_k F_N) /
     R. Discontinuous at slip onset unless mu_s = mu_k: gradients across it are biased, and zero by
