@@ -24,16 +24,16 @@ FLOWS = {
         arguments mesh shapes state contact rate_and_state ageing material hyperelastic elements
         pads matched balance multibond parts
         names motion validity graph structure energy statics start channels namespace rig
-        extensions setup .
+        setup .
     """,
-    "physics.mesh": "mesh block files quads .",
+    "physics.mesh": "element mesh block files quads .",
     "physics.shapes": "shape rounded contour eccentric .",
     "solve": """
-        kernel laws steps progress model parameters stepper gradients trajectory netcdf vtk mcap
-        diagnostics simulate batch torchdiffeq .
+        kernel laws steps progress rig_arrays model parameters stepper gradients trajectory
+        netcdf vtk mcap diagnostics simulate batch torchdiffeq .
     """,
     "sysid": """
-        sentences
+        sentences extensions
         initial_state recording unknowns noise prediction runs alternatives assumptions problem
         first_samples
         synthetic fit plan prechecks

@@ -53,13 +53,13 @@ from torchsoft import (
     Yeoh,
     controller,
 )
-from torchsoft.physics.extensions import extend, extensions
 from torchsoft.physics.hyperelastic import Hyperelastic, invariants
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.motion import Lines, Waves, wave
 from torchsoft.physics.statics import standing
 from torchsoft.solve.kernel.arrays import GAMMA
 from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.sysid.extensions import extend, extensions
 from torchsoft.testing import check_power
 
 MESH = PadMesh(60e-3, 4.59e-3, 30, 2)

@@ -8,8 +8,8 @@ import pytest
 from conftest import COARSE, paper, rest, still, times
 
 from torchsoft import simulate
-from torchsoft.physics.extensions import extend, extensions
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown
+from torchsoft.sysid.extensions import extend, extensions
 
 MODEL = still(COARSE)
 POWER = "laws.steel_on_rubber.power"

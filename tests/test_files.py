@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from torchsoft import csvfile
+from torchsoft import csvfile, files
 from torchsoft.files import (
     PARTIAL,
     check_seal,
     claim,
+    held,
     remove_partials,
     replacing,
     seal,
@@ -88,6 +89,17 @@ def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path):
         mine.write_bytes(b"done")
     assert path.read_bytes() == b"done"
     assert sorted(os.listdir(tmp_path)) == ["file", "file.old.partial", "file.partial"]
+
+
+def test_a_new_name_is_taken_where_another_process_holds_a_partial_file(tmp_path, monkeypatch):
+    """One that takes it for a file that a killed writer left."""
+    locks, taken = [None], []
+    own = lambda path: taken.append(path) or (locks.pop() if locks else held(path))
+    monkeypatch.setattr(files, "held", own)
+    with replacing(tmp_path / "a.txt") as partial:
+        partial.write_text("whole")
+    assert (tmp_path / "a.txt").read_text() == "whole"
+    assert len({one for one in taken if one.suffix == ".partial"}) == 2
 
 
 def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path):

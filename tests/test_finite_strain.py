@@ -32,14 +32,15 @@ from torchsoft import (
 )
 from torchsoft.codegen import compile_law
 from torchsoft.physics import elements
-from torchsoft.physics.elements import element_constants, element_potentials
+from torchsoft.physics.elements import element_potentials
 from torchsoft.physics.hyperelastic import described, invariants, plane
+from torchsoft.physics.mesh.element import QUADRILATERAL, element_constants
 from torchsoft.solve.kernel.arrays import LANES
 from torchsoft.solve.laws import Factors, as_law, element
 from torchsoft.testing import CheckFailed, check_energy
 
 SKEWED = np.array([[[0.0, 0.0], [1.0, 0.02], [1.05, 1.0], [0.03, 0.9]]]) * 1e-3
-CONSTANTS = torch.from_numpy(element_constants(SKEWED)[0])
+CONSTANTS = torch.from_numpy(element_constants(QUADRILATERAL, SKEWED)[0])
 KINDS = pytest.mark.parametrize("kind", ENERGIES)
 EVERY = pytest.mark.parametrize(
     "material",
@@ -178,7 +179,7 @@ def test_forces_are_those_of_another_program(monkeypatch):
         (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]), -1
     ).reshape(-1, 4)
     rubber = NeoHookean(E=7.5e5, nu=0.45, rho=1.0, tau=1.0, depth=1.0)
-    constants = torch.from_numpy(element_constants(nodes[quads]))
+    constants = torch.from_numpy(element_constants(QUADRILATERAL, nodes[quads]))
     forces = {}
     for within in (0.0, elements.WITHIN):
         monkeypatch.setattr(elements, "WITHIN", within)

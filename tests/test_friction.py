@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from torchsoft import AgeingSlip, Coulomb, RateAndState, RigFile, SmoothSlip, SoftContact
 from torchsoft.physics.contact import ContactState
-from torchsoft.physics.extensions import extend
 from torchsoft.rigs.check import check
+from torchsoft.sysid.extensions import extend
 
 K, R = 1e5, 400.0
 """Springs [N/m] and dashpots [N.s/m] of the laws below."""

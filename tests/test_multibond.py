@@ -23,10 +23,9 @@ def test_the_moment_on_the_bracket_is_that_of_the_bonded_nodes():
     port = graph.ports["pad_U"]
     strain = u + material.chain()[1] * port.transformer.flow(graph.flows)
     lame_lambda, lame_mu = (x.item() for x in pad.factors()[2:])
-    element = lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1]
     displaced = torch.zeros(len(mesh.nodes), 2, dtype=torch.float64)
     displaced[torch.from_numpy(mesh.free)] = strain @ axes
-    K = mesh.assemble(material.depth.item() * element, all_nodes=True)
+    K = material.depth.item() * mesh.stiffness(lame_lambda, lame_mu, all_nodes=True)
     force = torch.from_numpy(K @ displaced.flatten().numpy()).reshape(-1, 2) @ axes.mT
     bonded, base = torch.from_numpy(mesh.bonded), torch.from_numpy(pad.placed(mesh.nodes))
     cross = lambda r, F: float((r[:, 0] * F[:, 1] - r[:, 1] * F[:, 0]).sum())

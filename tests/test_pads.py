@@ -14,6 +14,7 @@ from skfem import (
     Basis,
     ElementQuad1,
     ElementQuad2,
+    ElementQuadS2,
     ElementVector,
     FacetBasis,
     LinearForm,
@@ -23,6 +24,9 @@ from skfem import (
 )
 
 from torchsoft import (
+    Body,
+    Circle,
+    Contact,
     CurvedPadMesh,
     FingertipMesh,
     GeneralisedKelvin,
@@ -32,10 +36,16 @@ from torchsoft import (
     PadMesh,
     Prony,
     QuadMesh,
+    Rig,
+    SmoothSlip,
+    SoftContact,
     StandardLinearSolid,
     Taxels,
+    simulate,
 )
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli
+from torchsoft.physics.mesh.element import Element
+from torchsoft.physics.mesh.mesh import StoredMesh
 
 ROUNDING, SOLVED = 1e-12, 1e-10
 """Parts of the largest entry: two assemblies of the same integrals; two solutions of one system."""
@@ -85,9 +95,11 @@ def rubber(nu: float = 0.45) -> KelvinVoigt:
 
 
 def test_assembly_equals_scikit_fem(mesh):
-    for mine, want in zip(mesh.matrices, matrices(mesh.nodes, mesh.elements)):
-        got = mesh.assemble(mine, all_nodes=True).toarray()
+    *stiffness, M = matrices(mesh.nodes, mesh.elements)
+    for moduli, want in zip(((1.0, 0.0), (0.0, 1.0)), stiffness):
+        got = mesh.stiffness(*moduli, all_nodes=True).toarray()
         assert np.abs(got - want).max() < ROUNDING * np.abs(want).max()
+    assert mesh.areas == pytest.approx(M.sum(1)[::2], rel=1e-12)
 
 
 def test_a_linear_displacement_has_forces_at_the_boundary_only(mesh):
@@ -96,7 +108,7 @@ def test_a_linear_displacement_has_forces_at_the_boundary_only(mesh):
     strain = (gradient + gradient.T) / 2
     lame_lambda, lame_mu = lame_moduli(1.0, 0.4)
     stress = lame_lambda * np.trace(strain) * np.eye(2) + 2 * lame_mu * strain
-    K = mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True)
+    K = mesh.stiffness(lame_lambda, lame_mu, all_nodes=True)
     force = (K @ (mesh.nodes @ gradient.T + [3e-3, -1e-3]).ravel()).reshape(-1, 2)
     expected, around = np.zeros_like(force), mesh.outline
     sides = mesh.nodes[np.roll(around, -1)] - mesh.nodes[around]
@@ -170,11 +182,100 @@ def test_contact_points_stand_for_the_whole_face(mesh, points):
     beside = 0.5 * (every[-1] - every[0] - s[-1] + s[0])  # half of the sides to a held node
     lengths = pad.point_lengths
     assert lengths.sum() == pytest.approx(s[-1] - s[0] + beside * (points == 0), rel=1e-12)
-    assert pad.spread.sum(1).numpy() == pytest.approx(np.ones(len(lengths)), abs=1e-15)
+    assert pad.interpolation.sum(1).numpy() == pytest.approx(np.ones(len(lengths)), abs=1e-15)
     assert len(lengths) == (len(s) if points == 0 else points * (len(s) - 1))
     if points == 3:
         integral = (lengths * pad.point_coordinates**4).sum()
         assert integral == pytest.approx((s[-1] ** 5 - s[0] ** 5) / 5, rel=1e-12)
+
+
+# an element that is not shipped: a quadratic quadrilateral of eight nodes
+
+AROUND = np.array([[-1, -1], [0, -1], [1, -1], [1, 0], [1, 1], [0, 1], [-1, 1], [-1, 0]], float)
+GAUSS_3 = tuple((x, y, v * w) for x, v in zip(*np.polynomial.legendre.leggauss(3))
+                for y, w in zip(*np.polynomial.legendre.leggauss(3)))  # fmt: skip
+
+
+def serendipity(x: Any, y: Any) -> tuple[Array, Array]:
+    """Shape functions (8,) and their slopes (8, 2)."""
+    powers = lambda x, y: np.stack((x**0, x, y, x * y, x**2, y**2, x**2 * y, x * y**2), -1)
+    by_x = np.array([0, 1, 0, y, 2 * x, 0, 2 * x * y, y**2])
+    by_y = np.array([0, 0, 1, x, 0, 2 * y, x**2, 2 * x * y])
+    weights = np.linalg.inv(powers(*AROUND.T))
+    return powers(x, y) @ weights, np.stack((by_x @ weights, by_y @ weights), -1)
+
+
+QUADRATIC = Element(8, 3, serendipity, GAUSS_3, GAUSS_3)
+
+
+class QuadraticMesh(StoredMesh):
+    element = QUADRATIC
+
+
+def quadratic() -> QuadraticMesh:
+    """A block of 4 by 2 elements whose inner corners are anywhere."""
+    block = PadMesh(20e-3, 6e-3, 8, 4)
+    x, grid = block.nodes.reshape(9, 5, 2).copy(), block.grid
+    x[2:-1:2, 2] += 0.6e-3 * np.random.default_rng(5).standard_normal((3, 2))
+    x[1::2, ::2] = 0.5 * (x[:-1:2, ::2] + x[2::2, ::2])
+    x[:, 1::2] = 0.5 * (x[:, :-1:2] + x[:, 2::2])
+    column, row = (AROUND.T + 1).astype(int)
+    elements = np.stack([grid[i + column, j + row] for i in range(0, 8, 2) for j in (0, 2)])
+    used, elements = np.unique(elements, return_inverse=True)
+    nodes, face = x.reshape(-1, 2)[used], np.searchsorted(used, grid[:, -1])
+    return QuadraticMesh(nodes, elements.reshape(-1, 8), nodes[:, 1] == 0, face)
+
+
+def test_a_quadratic_element_passes_the_patch_test():
+    """A constant strain loads the boundary only, as much as its stress; rigid motions load
+    nothing."""
+    mesh, moduli = quadratic(), lame_moduli(1.0, 0.4)
+    K, strain = mesh.stiffness(*moduli, all_nodes=True), np.array([[0.3, 0.2], [0.2, 0.4]])
+    stress = moduli[0] * np.trace(strain) * np.eye(2) + 2 * moduli[1] * strain
+    force = (K @ (mesh.nodes @ strain).ravel()).reshape(-1, 2)
+    scale = np.abs(K.toarray()).max() * np.abs(mesh.nodes).max()
+    inside = np.setdiff1d(np.arange(len(mesh.nodes)), mesh.outline)
+    assert len(inside) > 10
+    assert np.abs(force[inside]).max() < ROUNDING * scale
+    assert force[mesh.face].sum(0)[1] > 0
+    virial = np.einsum("ni,nj->ij", force, mesh.nodes)  # of all of the boundary's forces
+    assert virial == pytest.approx(stress * mesh.areas.sum(), abs=ROUNDING * scale)
+    for rigid in (mesh.nodes @ np.array([[0.0, 1.0], [-1.0, 0.0]]), np.full(mesh.nodes.shape, 0.7)):
+        assert np.abs(K @ rigid.ravel()).max() < ROUNDING * np.abs(K.toarray()).max()
+
+
+@pytest.mark.parametrize("points", [0, 3])
+def test_a_linear_pad_has_quadratic_elements(points):
+    """Its compliance is that of scikit-fem's, and its contact points are on the face."""
+    mesh = quadratic()
+    pad, moduli = Pad(mesh, rubber(0.4), points=points), lame_moduli(0.75e6, 0.4)
+    corners = mesh.elements[:, ::2]
+    used, quads = np.unique(corners, return_inverse=True)
+    grid = MeshQuad(mesh.nodes[used].T.copy(), quads.reshape(-1, 4).T.copy())
+    basis = Basis(grid, ElementVector(ElementQuadS2()), intorder=5)
+    K = moduli[0] * dilatation.assemble(basis) + moduli[1] * shear.assemble(basis)
+    places = mesh.nodes[mesh.free]
+    order = np.array([np.abs(np.asarray(basis.doflocs).T - x).sum(1).argsort()[:2] for x in places])
+    order = np.sort(order, 1).ravel()  # x before y
+    C = np.linalg.inv(44e-3 * K.toarray()[order][:, order])
+    on = (2 * mesh.surface[:, None] + np.arange(2)).ravel()
+    got = pad.compliance().detach().numpy()
+    assert np.abs(got - C[on][:, on]).max() < SOLVED * np.abs(got).max()
+    place = pad.point_positions.numpy()
+    assert place[:, 1] == pytest.approx(np.full(len(place), 6e-3), rel=1e-12)
+    assert pad.point_lengths.sum() == pytest.approx(20e-3, rel=1e-12)
+    if points:
+        integral = (pad.point_lengths * place[:, 0] ** 4).sum()
+        assert integral == pytest.approx(20e-3**5 / 5, rel=1e-12)
+    law = SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.5, 0.4, 5e-2))
+    contacts = {"P": Contact("P", "disc", law)}
+    rig = Rig(bodies={"disc": Body(0.4, Circle(0.02))}, pads={"P": pad}, contacts=contacts)
+    state = rig.unpack(rig.state(disc={"x": 0.01, "y": "rest"}).detach())
+    assert float(state.pads["P"][..., 1].sum()) == pytest.approx(-0.4 * 9.81, rel=1e-9)
+    with pytest.raises(NotImplementedError, match=r"`P` has 3 nodes on a side, .* compiled for 2"):
+        simulate(rig, [0.0, 0.01], y0=rig.pack(state))
+    with pytest.raises(NotImplementedError, match="bilinear quadrilaterals"):
+        Pad(mesh, rubber(), inertial=True)
 
 
 def test_face_outline_and_base_are_those_of_the_nodes(mesh):
@@ -183,8 +284,7 @@ def test_face_outline_and_base_are_those_of_the_nodes(mesh):
     assert np.all(np.isin(mesh.face, mesh.outline))
     x, y = mesh.nodes[mesh.outline].T
     area = 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum()
-    M = mesh.assemble(mesh.matrices[2], all_nodes=True)
-    assert M.sum() / 2 == pytest.approx(area, rel=1e-13)
+    assert mesh.areas.sum() == pytest.approx(area, rel=1e-13)
     corners, under = mesh.back
     np.testing.assert_array_equal(corners[[0, -1]], face[[-1, 0]])
     base, way = mesh.base, np.linalg.norm(np.diff(corners, axis=0), axis=1)
@@ -232,7 +332,7 @@ def test_a_fingertip_is_half_a_disc():
         ways = np.diff(mesh.nodes[mesh.elements[:, [0, 1, 2, 3, 0]]], axis=1)
         sides = np.linalg.norm(ways, axis=-1)
         assert (sides.max(1) / sides.min(1)).max() < 2.5
-        areas.append(mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2)
+        areas.append(mesh.areas.sum())
     errors = 1 - np.array(areas) / (0.5 * np.pi * RADIUS**2)
     assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(np.full(2, 2.0), abs=0.02)
 

@@ -130,9 +130,18 @@ def test_a_wrong_gradient_is_named():
     assert whole == pytest.approx(2 * half, rel=1e-3)
 
 
-def test_noise_that_agrees_by_chance_does_not_make_a_derivative_wrong():
-    """Of a value with noise of 1e-11 the two shortest differences agree, and are off by 5e-3."""
-    slope, noise = 0.1, {1e-10: 3e-2, 1e-9: -5e-3, 3e-9: -5.01e-3, 1e-8: 1e-3, 3e-8: -3e-4}
+@pytest.mark.parametrize(
+    "noise",
+    [
+        {1e-10: 3e-2, 1e-9: -5e-3, 3e-9: -5.01e-3, 1e-8: 1e-3, 3e-8: -3e-4},
+        {  # the forces of a run of 1900 steps: those at 1e-8 and 3e-8 agree
+            1e-10: 7.8e-3, 1e-9: -6.68e-4, 3e-9: -3.97e-4, 1e-8: -5.7e-5, 3e-8: -7.52e-5,
+            1e-7: 3.42e-5, 1e-6: 2e-7,
+        },
+    ],
+)  # fmt: skip
+def test_noise_that_agrees_by_chance_does_not_make_a_derivative_wrong(noise):
+    slope = 0.1
     differenced = lambda h: {"value": slope + noise.get(h, 1e-12 / h)}
     ((found, by),) = gradients._judged(differenced, {"value": slope}, {"value": 1.0}, 1e-5).values()
     assert abs(found - slope) <= 2 * by

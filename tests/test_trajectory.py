@@ -17,11 +17,11 @@ from torch import Tensor
 import torchsoft
 from torchsoft import Rig, Trajectory, simulate, simulate_batch
 from torchsoft.display import hidden
-from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import von_mises
 from torchsoft.rigs.written import template
 from torchsoft.solve.netcdf import save
 from torchsoft.sysid.columns import read_csv
+from torchsoft.sysid.extensions import extend
 from torchsoft.sysid.measured import vocabulary
 
 T = times(0.1, 11)

@@ -50,15 +50,16 @@ def replacing(path: str | Path, durable: bool = False) -> Iterator[Path]:
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; name a file, perhaps one in it")
     remove_partials(path.parent.glob(f"{escape(path.name)}.*.partial"))
-    partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
     try:
-        own = held(partial)
+        while True:
+            partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
+            if (own := held(partial)) is not None:  # another process may take it for a left one
+                break
     except UnicodeEncodeError:
         raise ValueError(
             f"{str(path)!r} cannot be a file's name in this locale, whose names are in "
             f"{sys.getfilesystemencoding()}; take another name, or set LC_ALL=C.UTF-8"
         ) from None
-    assert own is not None  # of a name of its own
     try:
         yield partial
         if durable:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.codegen import emit
-from torchsoft.codegen.graph import Graph, adjoints, dependent, jacobian
+from torchsoft.codegen.graph import ScalarGraph, adjoints, dependent, jacobian
 from torchsoft.codegen.trace import Trace, UnknownOperation, check_backward, traced
 
 __all__ = ["Law", "UnknownOperation", "compile_law"]
@@ -70,7 +70,7 @@ def compile_law(
     """
     _check(x, parameters)
     check_backward(function, x, parameters)
-    graph = Graph()
+    graph = ScalarGraph()
     outputs = traced(graph, function, x, parameters, kind=kind)
     elsewhere = {name: 0.9 * tensor.detach() + 0.01 for name, tensor in parameters.items()}
     if traced(graph, function, 0.9 * x.detach() + 0.01, elsewhere, kind=kind) != outputs:
@@ -90,7 +90,7 @@ def compile_law(
     return Law(count, len(outputs), linear, differentiated, *addresses)
 
 
-def _forces(g: Graph, potentials: list[int], n: int) -> list[int]:
+def _forces(g: ScalarGraph, potentials: list[int], n: int) -> list[int]:
     """Forces (n,) and power of an energy and a dissipation potential."""
     energy, potential = potentials
     u, rate = ([g.leaf("x", first + i) for i in range(n)] for first in (0, n))
@@ -101,7 +101,12 @@ def _forces(g: Graph, potentials: list[int], n: int) -> list[int]:
 
 
 def _functions(
-    g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int, lanes: int
+    g: ScalarGraph,
+    outputs: list[int],
+    linear: int,
+    differentiated: int,
+    parameters: int,
+    lanes: int,
 ) -> list[str]:
     """IR of the entry points of a law."""
     x = [g.leaf("x", i) for i in range(differentiated)]
@@ -117,7 +122,7 @@ def _functions(
     ]
 
 
-def _pulled(g: Graph, outputs: list[int], parameters: int) -> tuple[list[int], list[int]]:
+def _pulled(g: ScalarGraph, outputs: list[int], parameters: int) -> tuple[list[int], list[int]]:
     """The parameters, with look-ups of them, and their cotangents under weights of the outputs."""
     p = [g.leaf("p", j) for j in range(parameters)]
     seeds: dict[int, int] = {}
@@ -130,7 +135,7 @@ def _pulled(g: Graph, outputs: list[int], parameters: int) -> tuple[list[int], l
     return p + lookups, adjoints(g, seeds, {}, dependent(g, p + lookups), p + lookups)
 
 
-def _push(g: Graph, outputs: list[int], p: list[int], p_bar: list[int], lanes: int) -> str:
+def _push(g: ScalarGraph, outputs: list[int], p: list[int], p_bar: list[int], lanes: int) -> str:
     """IR of the push: the pull is linear in its weights, and its derivative by them transposed is
     the push."""
     seeds: dict[int, int] = {}

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.codegen.graph import LEAVES, LOOKUPS, NAMED, Graph
+from torchsoft.codegen.graph import LEAVES, LOOKUPS, NAMED, ScalarGraph
 from torchsoft.codegen.operations import Nodes
 from torchsoft.codegen.trace import Trace, UnknownOperation, traced
 
@@ -50,7 +50,7 @@ _engines: dict[str, llvm.ExecutionEngine] = {}
 
 
 def function(
-    g: Graph, name: str, pointers: Iterable[str], results: Mapping[str, Iterable[int]],
+    g: ScalarGraph, name: str, pointers: Iterable[str], results: Mapping[str, Iterable[int]],
     added: Mapping[str, Iterable[tuple[int, int]]] | None = None, lanes: int = 1,
 ) -> str:  # fmt: skip
     """IR of void `name`(pointers...), which stores the nodes of `results` where the pointer of that
@@ -75,7 +75,7 @@ def function(
 class _Body:
     """Instructions of a function, with the name of every value that they have made."""
 
-    def __init__(self, g: Graph, lanes: int) -> None:
+    def __init__(self, g: ScalarGraph, lanes: int) -> None:
         self.g, self.lanes = g, lanes
         self.lines: list[str] = []
         self.text: dict[int, str] = {}
@@ -187,7 +187,9 @@ class _Body:
             yield f"{name} = call double @{FUNCTIONS[op]}({given})"
 
 
-def _address(g: Graph, node: int, pointer: str, name: str, operands: list[str]) -> Iterator[str]:
+def _address(
+    g: ScalarGraph, node: int, pointer: str, name: str, operands: list[str]
+) -> Iterator[str]:
     """The place of a leaf or a look-up from `pointer` on; a number outside the table, or none, is
     the first entry's."""
     if g.ops[node] in LEAVES:
@@ -274,7 +276,7 @@ class Watch(Trace):
 
     size: int
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: ScalarGraph) -> None:
         super().__init__(graph)
         self._points: dict[int, frozenset[int]] = {}
 
@@ -324,7 +326,7 @@ def check_pointwise(
     """Raises UnknownOperation for function(x, parameters), an (..., outputs) tensor of x (...,
     inputs), whose value at a point depends on other points; names the operation and its line. A law
     that fails otherwise is left to `traced`."""
-    graph, size = Graph(), x.numel()
+    graph, size = ScalarGraph(), x.numel()
     many = torch.stack([x.detach() * (1 + 0.1 * k) for k in range(POINTS)])
 
     def parallel_map(flat: Tensor, values: dict[str, Tensor]) -> Tensor:

@@ -1,6 +1,6 @@
 """The scalar expression graph of a law.
 
-A node is an integer; its operation and arguments stand in `Graph.ops` and `Graph.args`. Equal
+A node is an integer; its operation and arguments are in `ops` and `args` of the graph. Equal
 expressions are one node, and an argument always has a smaller number than the node that uses it.
 """
 
@@ -42,7 +42,7 @@ ENTIRE = {
 }
 
 
-class Graph:
+class ScalarGraph:
     """Scalar expressions of float64 and truth values, each held once."""
 
     def __init__(self) -> None:
@@ -205,7 +205,7 @@ class Graph:
         return None
 
 
-def power(g: Graph, base: int, exponent: int) -> int:
+def power(g: ScalarGraph, base: int, exponent: int) -> int:
     """base**exponent, with the products and roots that torch takes for small constant exponents."""
     square = lambda: g("mul", base, base)
     simple: dict[float, Callable[[], int]] = {
@@ -222,7 +222,7 @@ def power(g: Graph, base: int, exponent: int) -> int:
     return simple[value]() if value in simple else g("pow", base, exponent)
 
 
-def sign(g: Graph, a: int) -> int:
+def sign(g: ScalarGraph, a: int) -> int:
     """1, 0 or -1, as constants that have no derivative."""
     below = g("select", g("lt", a, g.zero), g.constant(-1.0), g.zero)
     return g("select", g("gt", a, g.zero), g.one, below)
@@ -235,16 +235,16 @@ def sign(g: Graph, a: int) -> int:
 Partials = list[tuple[int, int]]  # pairs (argument, partial derivative)
 
 
-def _plus_square(g: Graph, a: int, sign: str = "add") -> int:
+def _plus_square(g: ScalarGraph, a: int, sign: str = "add") -> int:
     return g(sign, g.one, g("mul", a, a))
 
 
-def _div(g: Graph, adj: int, y: int, a: int, b: int) -> tuple:
+def _div(g: ScalarGraph, adj: int, y: int, a: int, b: int) -> tuple:
     over = g.quotient(adj, b)
     return over, g("neg", g.product(over, y))
 
 
-def _pow(g: Graph, adj: int, y: int, a: int, b: int) -> tuple:
+def _pow(g: ScalarGraph, adj: int, y: int, a: int, b: int) -> tuple:
     by_base = g.product(adj, g("mul", b, power(g, a, g("sub", b, g.one))))
     by_base = g("select", g("eq", b, g.zero), g.zero, by_base)
     flat = g("and", g("eq", a, g.zero), g("ge", b, g.zero))
@@ -252,18 +252,18 @@ def _pow(g: Graph, adj: int, y: int, a: int, b: int) -> tuple:
     return by_base, by_exponent
 
 
-def _atan2(g: Graph, adj: int, y: int, a: int, b: int) -> tuple:
+def _atan2(g: ScalarGraph, adj: int, y: int, a: int, b: int) -> tuple:
     square = g("add", g("mul", a, a), g("mul", b, b))
     inverse = g("select", g("eq", square, g.zero), g.zero, g("div", g.one, square))
     return g.product(adj, g("mul", b, inverse)), g("neg", g.product(adj, g("mul", a, inverse)))
 
 
-def _select(g: Graph, adj: int, y: int, c: int, a: int, b: int) -> tuple:
+def _select(g: ScalarGraph, adj: int, y: int, c: int, a: int, b: int) -> tuple:
     return None, g("select", c, adj, g.zero), g("select", c, g.zero, adj)
 
 
 def _extremum(above: str) -> Callable[..., tuple]:
-    def rule(g: Graph, adj: int, y: int, value: int, a: int, b: int) -> tuple:
+    def rule(g: ScalarGraph, adj: int, y: int, value: int, a: int, b: int) -> tuple:
         tie, half = g("eq", a, b), g("mul", adj, g.constant(0.5))
         first = g(above, a, b)
         to = lambda chosen: g("select", tie, half, g("select", chosen, adj, g.zero))
@@ -272,7 +272,7 @@ def _extremum(above: str) -> Callable[..., tuple]:
     return rule
 
 
-def _norm(g: Graph, adj: int, y: int, value: int, *entries: int) -> tuple:
+def _norm(g: ScalarGraph, adj: int, y: int, value: int, *entries: int) -> tuple:
     flat = g("eq", value, g.zero)
     return None, *(g.product(adj, g("select", flat, g.zero, g("div", a, value))) for a in entries)
 
@@ -318,7 +318,7 @@ RULES: dict[str, Callable[..., tuple]] = {
 }
 
 
-def dependent(g: Graph, targets: Iterable[int]) -> bytearray:
+def dependent(g: ScalarGraph, targets: Iterable[int]) -> bytearray:
     """For every node of the graph, whether it has a derivative in one of the targets."""
     marks = bytearray(len(g.ops))
     for target in targets:
@@ -330,7 +330,7 @@ def dependent(g: Graph, targets: Iterable[int]) -> bytearray:
 
 
 def adjoints(
-    g: Graph,
+    g: ScalarGraph,
     seeds: Mapping[int, int],
     rules: Mapping[int, Partials],
     marks: bytearray,
@@ -353,7 +353,7 @@ def adjoints(
 
 
 def _parts(
-    g: Graph, node: int, adjoint: int, rules: Mapping[int, Partials]
+    g: ScalarGraph, node: int, adjoint: int, rules: Mapping[int, Partials]
 ) -> Iterable[tuple[int, int | None]]:
     """The arguments of a node, each with its share of the node's adjoint."""
     if node in rules:
@@ -362,7 +362,7 @@ def _parts(
     return zip(args, RULES[g.ops[node]](g, adjoint, node, *args)) if g.ops[node] in RULES else ()
 
 
-def jacobian(g: Graph, outputs: Sequence[int], targets: Sequence[int]) -> list[list[int]]:
+def jacobian(g: ScalarGraph, outputs: Sequence[int], targets: Sequence[int]) -> list[list[int]]:
     """∂output/∂target, one row per output: a reverse sweep each; nodes that several outputs have in
     common stand once."""
     marks = dependent(g, targets)
@@ -370,7 +370,7 @@ def jacobian(g: Graph, outputs: Sequence[int], targets: Sequence[int]) -> list[l
     return [adjoints(g, {node: g.one}, rules, marks, targets) for node in outputs]
 
 
-def _shared(g: Graph, outputs: set[int], marks: bytearray) -> dict[int, Partials]:
+def _shared(g: ScalarGraph, outputs: set[int], marks: bytearray) -> dict[int, Partials]:
     """Partial derivatives of the nodes through which alone the outputs depend on much of the graph.
 
     Such a node, a network's result for example, is differentiated once, in the arguments of the
@@ -397,7 +397,7 @@ def _shared(g: Graph, outputs: set[int], marks: bytearray) -> dict[int, Partials
     return rules
 
 
-def _dominators(g: Graph, outputs: set[int], marks: bytearray) -> dict[int, int]:
+def _dominators(g: ScalarGraph, outputs: set[int], marks: bytearray) -> dict[int, int]:
     """For every dependent node that an output uses, the first later node that all its ways to an
     output have in common.
 

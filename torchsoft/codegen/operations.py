@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchsoft.codegen.graph import Graph, power, sign
+from torchsoft.codegen.graph import ScalarGraph, power, sign
 
 Nodes = NDArray[np.int64]
 
@@ -47,21 +47,21 @@ def _extremum(op: str, better: str) -> Callable[..., int]:
 _maximum, _minimum = _extremum("maximum", "ge"), _extremum("minimum", "le")
 
 
-def _norm(g: Graph, *entries: int) -> int:
+def _norm(g: ScalarGraph, *entries: int) -> int:
     return g("norm", g("sqrt", g.total(g("mul", a, a) for a in entries)), *entries)
 
 
-def _add(g: Graph, a: int, b: int, alpha: int | None = None, op: str = "add") -> int:
+def _add(g: ScalarGraph, a: int, b: int, alpha: int | None = None, op: str = "add") -> int:
     return g(op, a, b if alpha is None else g("mul", alpha, b))
 
 
-def _div(g: Graph, a: int, b: int, rounding_mode: str | None = None) -> int:
+def _div(g: ScalarGraph, a: int, b: int, rounding_mode: str | None = None) -> int:
     if rounding_mode is not None:
         raise TypeError("a division that rounds")
     return g("div", a, b)
 
 
-def _converted(g: Graph, a: int, dtype: Any = None, **_: Any) -> int:
+def _converted(g: ScalarGraph, a: int, dtype: Any = None, **_: Any) -> int:
     """The same number; conversion to int64 truncates."""
     if dtype != torch.int64:
         return a
@@ -106,7 +106,12 @@ ELEMENTWISE: dict[str, Callable[..., int]] = {
 
 
 def _reduced(
-    fold: Callable[..., int], g: Graph, x: Nodes, dim: Any = None, keepdim: bool = False, **_: Any
+    fold: Callable[..., int],
+    g: ScalarGraph,
+    x: Nodes,
+    dim: Any = None,
+    keepdim: bool = False,
+    **_: Any,
 ) -> Nodes:
     """`fold(graph, entries)` over the axes `dim`; over all where it is None or empty."""
     axes = range(x.ndim) if dim is None else [dim] if isinstance(dim, int) else dim
@@ -125,7 +130,7 @@ def _reduced(
 def _place(better: str) -> Callable[..., int]:
     """Place of the first of the best entries, as a number that has no derivative."""
 
-    def fold(g: Graph, entries: Sequence[int]) -> int:
+    def fold(g: ScalarGraph, entries: Sequence[int]) -> int:
         best, place = entries[0], g.zero
         for i, entry in enumerate(entries[1:], 1):
             found = g(better, entry, best)
@@ -135,8 +140,8 @@ def _place(better: str) -> Callable[..., int]:
     return fold
 
 
-_FOLDS: dict[str, Callable[[Graph, Sequence[int]], int]] = {
-    "sum": Graph.total,
+_FOLDS: dict[str, Callable[[ScalarGraph, Sequence[int]], int]] = {
+    "sum": ScalarGraph.total,
     "mean": lambda g, entries: g("div", g.total(entries), g.constant(len(entries))),
     "prod": lambda g, entries: reduce(partial(g, "mul"), entries, g.one),
     "any": lambda g, entries: reduce(partial(g, "or"), entries, g.constant(False)),
@@ -148,14 +153,14 @@ _FOLDS: dict[str, Callable[[Graph, Sequence[int]], int]] = {
 }
 
 
-def _vector_norm(g: Graph, x: Nodes, ord: float = 2, *axes: Any, **options: Any) -> Nodes:
+def _vector_norm(g: ScalarGraph, x: Nodes, ord: float = 2, *axes: Any, **options: Any) -> Nodes:
     if ord != 2:
         raise TypeError(f"a vector norm of order {ord}")
     return _reduced(lambda g, entries: _norm(g, *entries), g, x, *axes, **options)
 
 
 def _looked_up(
-    g: Graph,
+    g: ScalarGraph,
     table: Nodes,
     places: Nodes,
     padding: int = -1,
@@ -168,7 +173,7 @@ def _looked_up(
     return np.stack([mapped(partial(g.lookup, column), places) for column in table.T.tolist()], -1)
 
 
-def _pad(g: Graph, x: Nodes, pad: Sequence[int], value: float = 0.0) -> Nodes:
+def _pad(g: ScalarGraph, x: Nodes, pad: Sequence[int], value: float = 0.0) -> Nodes:
     return torch.constant_pad_nd(torch.from_numpy(x), pad, g.constant(float(value))).numpy()
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.codegen import Law, compile_law
-from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.graph import ScalarGraph
 from torchsoft.codegen.operations import Nodes
 from torchsoft.codegen.trace import Trace, source_line, traced
 
@@ -88,7 +88,7 @@ def left_out(
     Raises `UnknownOperation` as `compile_law` does.
     """
     every = opened()
-    traced(Graph(), function, x[0], parameters, kind=every)
+    traced(ScalarGraph(), function, x[0], parameters, kind=every)
     if not every.lines:
         return None
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.graph import ScalarGraph
 from torchsoft.codegen.operations import (
     COMPOSED,
     CONSTANT,
@@ -74,7 +74,7 @@ class Trace(TorchDispatchMode):
     """Runs every operation and, where it depends on a symbolic tensor, records each entry of the
     result: without derivatives where torch records none, as under torch.no_grad()."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: ScalarGraph) -> None:
         super().__init__()
         self.graph = graph
         self._nodes: dict[
@@ -235,7 +235,7 @@ class Trace(TorchDispatchMode):
 
 
 def traced(
-    graph: Graph,
+    graph: ScalarGraph,
     function: Callable[[Tensor, dict[str, Tensor]], Tensor],
     x: Tensor,
     parameters: Mapping[str, Tensor],

@@ -85,7 +85,7 @@ def series(subject: Subject, rig: Rig, run: Trajectory) -> Row:
             out[f"friction_force_{name}"] = run.force[name][..., 1].numpy()
             depth = rig.penetration(name, run.state)
             out[f"contact_{name}"] = (depth > 0).numpy().astype(np.uint8)
-        out[f"displacement_{pad}"] = (rig.pads[pad].spread @ run.displacement[pad]).numpy()
+        out[f"displacement_{pad}"] = (rig.pads[pad].interpolation @ run.displacement[pad]).numpy()
     for kind, (_, parts) in energies(subject.template).items():
         known = run.energy if kind == "stored" else getattr(run, kind)
         out[f"{kind}_energy"] = np.stack([known[part].numpy() for part in parts], -1)

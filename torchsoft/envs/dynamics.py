@@ -192,7 +192,7 @@ class Dynamics:
                 **self.solver,
             ).stepper  # fmt: skip
         t, lines = torch.tensor([0.0, LOOK]).double(), torch.zeros(len(self._set_by), 2).double()
-        motion = stepper.parameters.followed(self._following(reference, t, lines), 0.0)
+        motion = stepper.parameters.kernel_signals(self._following(reference, t, lines), 0.0)
         return Read(y0, reference, stepper, motion)
 
     @property

@@ -21,8 +21,8 @@ HALVINGS = 12
 """Halvings of a step of Newton's method at the most."""
 
 Forces = Callable[[Tensor], Tensor]
-"""A function of displacements, or of rates: of corners (..., elements, 8) to forces on them, or of
-contact points (..., points, 2) to forces on these."""
+"""A function of displacements, or of rates: of corners (..., elements, dofs) to forces on them, or
+of contact points (..., points, 2) to forces on these."""
 
 Solve = Callable[[Tensor], Tensor]
 """Step of Newton's method (..., n, 2) for a residual (..., n, 2), differentiable in it."""
@@ -143,21 +143,21 @@ class Banded:
 
     def __init__(self, pad: Pad) -> None:
         self.size = 2 * pad.nodes
-        row = np.broadcast_to(pad.corners[:, :, None], (*pad.corners.shape, 8))
+        row = np.broadcast_to(pad.corners[:, :, None], (*pad.corners.shape, pad.corners.shape[1]))
         column = np.swapaxes(row, 1, 2)
         self.kept = (row >= 0) & (column >= 0)
-        own = pad.surface.numpy()[pad.point_nodes]
-        nodes = np.broadcast_to(own[:, :, None, None, None], (len(own), 2, 2, 2, 2))
-        others = np.broadcast_to(own[:, None, :, None, None], nodes.shape)
-        r, c = (np.arange(2)[None, None, None, :, None], np.arange(2))
         self.shares = pad.point_shares[:, :, None] * pad.point_shares[:, None, :]
-        self.row = np.concatenate((row[self.kept], (2 * nodes + r).ravel()))
-        self.column = np.concatenate((column[self.kept], (2 * others + c).ravel()))
+        own, shape = pad.surface.numpy()[pad.point_nodes], (*self.shares.shape, 2, 2)
+        dofs = 2 * own[:, :, None] + np.arange(2)  # (points, side, 2)
+        r = np.broadcast_to(dofs[:, :, None, :, None], shape)
+        c = np.broadcast_to(dofs[:, None, :, None, :], shape)
+        self.row = np.concatenate((row[self.kept], r.ravel()))
+        self.column = np.concatenate((column[self.kept], c.ravel()))
         self.band = int(np.abs(self.row - self.column).max(initial=0))
 
     def factor(self, elements: Array, contacts: Array) -> "Factor":
         """The factorised derivative of the residual, internal less contact forces, of those of the
-        elements' forces (elements, 8, 8) and of the points' (points, 2, 2)."""
+        elements' forces (elements, dofs, dofs) and of the points' (points, 2, 2)."""
         A = np.zeros((3 * self.band + 1, self.size), order="F")
         on_nodes = self.shares[:, :, :, None, None] * contacts[:, None, None]
         values = np.concatenate((elements[self.kept], -on_nodes.ravel()))
@@ -226,19 +226,25 @@ class Nodes:
         """Contact less internal forces (..., nodes, 2) [N]."""
         pad = self.pad
         left = -pad.from_corners(self.internal(pad.at_corners(x)))
-        return left if self.law is None else left + pad.spread.mT @ self.law(pad.spread @ x)
+        return (
+            left
+            if self.law is None
+            else left + pad.interpolation.mT @ self.law(pad.interpolation @ x)
+        )
 
     def linearised(self, x: Tensor) -> Solve:
         """By factors of the derivative of internal less contact forces, sample by sample."""
         pad = self.pad
         with torch.enable_grad():
-            at = pad.at_corners(x).expand(8, *x.shape[:-2], -1, -1).clone().requires_grad_()
+            at = pad.at_corners(x)
+            at = at.expand(at.shape[-1], *at.shape).clone().requires_grad_()
             each = self.internal(at).movedim(-1, 0).diagonal(0, 0, 1)  # a copy for each component
             (rows,) = torch.autograd.grad(each.sum(), at)
-        elements = rows.movedim(0, -2).reshape(-1, *pad.corners.shape, 8)
-        contacts = torch.zeros(len(elements), len(pad.spread), 2, 2, dtype=x.dtype)
+        elements = rows.movedim(0, -2)
+        elements = elements.reshape(-1, *elements.shape[-3:])
+        contacts = torch.zeros(len(elements), len(pad.interpolation), 2, 2, dtype=x.dtype)
         if self.law is not None:
-            contacts = slopes_at_points(self.law, pad.spread @ x).reshape(contacts.shape)
+            contacts = slopes_at_points(self.law, pad.interpolation @ x).reshape(contacts.shape)
         pairs = zip(elements.numpy(), contacts.numpy())
         return self.by_factors([self.banded.factor(*pair) for pair in pairs])
 

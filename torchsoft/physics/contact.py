@@ -263,7 +263,7 @@ class SmoothSlip(Friction):
 
 
 class Coulomb(Friction):
-    """Stick up to mu_s F_N, then mu_k F_N (Eq. 12-13 with the force's modulus).
+    """Stick up to mu_s F_N, then mu_k F_N (Eqs. 12-13 of the paper with the force's modulus).
 
     The spring re-anchors so that the Voigt pair carries just mu_k F_N, |gamma'| = (E - mu_k F_N) /
     R. Discontinuous at slip onset unless mu_s = mu_k: gradients across it are biased, and zero by
@@ -522,12 +522,10 @@ def relative_motion(x: Tensor) -> Tensor:
     angle = q_base[..., 2]
     r = turned(q[..., :2] - q_base[..., :2], -angle)
     r_dot = turned(V[..., :2] - V_base[..., :2], -angle) - V_base[..., 2:] * cross(r)
-    f, push = W[..., :2], turned(W[..., :2], angle)
+    f, force = W[..., :2], turned(W[..., :2], angle)
     moment = W[..., 2:] + r[..., :1] * f[..., 1:] - r[..., 1:2] * f[..., :1]
-    return torch.cat(
-        (r, (q - q_base)[..., 2:], r_dot, (V - V_base)[..., 2:], -push, -W[..., 2:], push, moment),
-        -1,
-    )
+    turn, turn_rate = (q - q_base)[..., 2:], (V - V_base)[..., 2:]
+    return torch.cat((r, turn, r_dot, turn_rate, -force, -W[..., 2:], force, moment), -1)
 
 
 def point_place(x: Tensor) -> tuple[Tensor, Tensor]:

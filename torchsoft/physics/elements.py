@@ -1,10 +1,9 @@
 """Elements of nodal pads: bilinear quadrilaterals in plane strain, each an energy of the
 displacements of its corners and a dissipation potential of their rates.
 
-An element's inputs x are displacements u (8), x and y corner by corner, then the v_b of every
-relaxing branch, the rates of them all, and its constants, as `element_constants` orders them. The
-force on a corner is the derivative of the energy by its displacement plus that of the potential by
-its rate; the power that the element dissipates is twice the potential.
+Its inputs x (see `mesh/element`) have the v_b of every relaxing branch beside the displacements u.
+The force on a corner is the derivative of the energy by its displacement plus that of the potential
+by its rate; the power that the element dissipates is twice the potential.
 
 The volume counts by its change at the centre, so that nearly incompressible elements do not lock.
 At finite strain the energy of distortion is one of the deformation gradient F at the Gauss points,
@@ -23,81 +22,16 @@ Turning u or v_b costs nothing, and what is dissipated is never negative.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchsoft.physics.hyperelastic import Hyperelastic, power
 from torchsoft.physics.material import Material
-from torchsoft.physics.mesh.mesh import Array, gradients
-
-GAUSS = [(a / np.sqrt(3), b / np.sqrt(3)) for a in (-1, 1) for b in (-1, 1)]
-"""Places of the quadrature in the reference square."""
+from torchsoft.physics.mesh.element import QUADRILATERAL, Place, Places, linear, places
 
 WITHIN = 1 / 3
 """Modulus against changes of volume within an element, over the shear modulus of small strains."""
-
-
-class Quadrilateral:
-    """Numbers of the element: its nodes, their displacements in one field, and its constants at one
-    place and in all."""
-
-    nodes = 4
-    dofs = 2 * nodes
-    at_place = dofs + 1
-    constants = at_place * (1 + len(GAUSS))
-
-
-def element_constants(corners: Array) -> Array:
-    """Constants (elements, 45) of elements with `corners` (elements, 4, 2) [m]: gradients of the
-    shape functions (8) and area, at the centre of the whole element, then at every Gauss point of
-    its share."""
-    parts = []
-    for xi, zeta in [(0.0, 0.0), *GAUSS]:
-        _, gradient, determinant = gradients(corners, xi, zeta)
-        share = float(len(GAUSS)) if not parts else 1.0
-        parts += [gradient.reshape(-1, Quadrilateral.dofs), share * abs(determinant)[:, None]]
-    return np.concatenate(parts, 1)
-
-
-class Place(NamedTuple):
-    """An area of an element, and gradients there of displacements and of their rates, each as (xx,
-    xy, yx, yy), xy that of x along y; of the Gauss points with these along the last axis."""
-
-    area: Tensor
-    gradient: tuple[Tensor, Tensor, Tensor, Tensor]
-    rate: tuple[Tensor, Tensor, Tensor, Tensor]
-
-
-Places = tuple[Place, Place]
-"""The centre, for the whole element, and the Gauss points."""
-
-
-def places(x: Tensor) -> list[Places]:
-    """Places of an element with the gradients of u, and with those of every v_b."""
-    own = Quadrilateral
-    constants = x[..., -own.constants :].unflatten(-1, (1 + len(GAUSS), own.at_place))
-    gx, gy, area = constants[..., :-1:2], constants[..., 1:-1:2], constants[..., -1]
-
-    def gradient(of: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        ux, uy = of[..., None, 0::2], of[..., None, 1::2]
-        xx, xy = (gx * ux).sum(-1), (gy * ux).sum(-1)
-        return xx, xy, (gx * uy).sum(-1), (gy * uy).sum(-1)
-
-    moved = x[..., : -own.constants].unflatten(-1, (2, -1, own.dofs))
-    fields = []
-    for u, rate in zip(moved[..., 0, :, :].unbind(-2), moved[..., 1, :, :].unbind(-2)):
-        of_u, of_rate = gradient(u), gradient(rate)
-
-        def at(which: int | slice, of_u: Any = of_u, of_rate: Any = of_rate) -> Place:
-            xx, xy, yx, yy = (one[..., which] for one in of_u)
-            x, a, b, y = (one[..., which] for one in of_rate)
-            return Place(area[..., which], (xx, xy, yx, yy), (x, a, b, y))
-
-        fields.append((at(0), at(slice(1, None))))
-    return fields
 
 
 def element_potentials(material: Material, factors: Tensor, x: Tensor) -> Tensor:
@@ -112,7 +46,7 @@ def element_potentials(material: Material, factors: Tensor, x: Tensor) -> Tensor
 def element_energy(material: Material, factors: Tensor, x: Tensor) -> Tensor:
     """Energy (...) [J] of an element in the state x (..., inputs)."""
     depth, _, lame_lambda, lame_mu, *arms = factors.unbind(-1)
-    own, *others = places(x)
+    own, *others = places(QUADRILATERAL, x)
     if not isinstance(material, Hyperelastic):
         return depth * linear(lame_lambda, lame_mu, *own, "gradient")
     W = finite_energy(material, lame_mu, *own)
@@ -124,7 +58,7 @@ def element_energy(material: Material, factors: Tensor, x: Tensor) -> Tensor:
 def element_potential(material: Material, factors: Tensor, x: Tensor) -> Tensor:
     """Dissipation potential (...) [W] of an element in the state x (..., inputs)."""
     depth, tau, lame_lambda, lame_mu, *arms = factors.unbind(-1)
-    own, *others = places(x)
+    own, *others = places(QUADRILATERAL, x)
     if not isinstance(material, Hyperelastic):
         return depth * tau * linear(lame_lambda, lame_mu, *own, "rate")
     bulk = lame_lambda + 2 / 3 * lame_mu
@@ -132,14 +66,6 @@ def element_potential(material: Material, factors: Tensor, x: Tensor) -> Tensor:
     for share, time, flown in zip(arms[::2], arms[1::2], others):
         total = total + share * time * flow_potential(bulk, lame_mu, *flown)
     return depth * total
-
-
-def linear(lame_lambda: Tensor, lame_mu: Tensor, centre: Place, gauss: Place, kind: str) -> Tensor:
-    """Energy per depth at small strains, or the same of their rates."""
-    x, _, _, y = getattr(centre, kind)
-    xx, xy, yx, yy = getattr(gauss, kind)
-    shear = lame_mu * gauss.area * (xx**2 + yy**2 + 0.5 * (xy + yx) ** 2)
-    return 0.5 * lame_lambda * centre.area * (x + y) ** 2 + shear.sum(-1)
 
 
 def finite_energy(
@@ -155,8 +81,8 @@ def finite_energy(
     zero, one = torch.zeros_like(J), torch.ones_like(J)
     rows = (1 + xx, xy, zero), (yx, 1 + yy, zero), (zero, zero, one)
     W = material.distortion(torch.stack([torch.stack(row, -1) for row in rows], -2))
-    W = W + WITHIN * shear * (J - J_0[..., None]) ** 2
-    return centre.area * material.dilatation(J_0) + (gauss.area * W).sum(-1)
+    W = W + WITHIN * shear * (J - J_0) ** 2
+    return (centre.area * material.dilatation(J_0)).sum(-1) + (gauss.area * W).sum(-1)
 
 
 def finite_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: Place) -> Tensor:
@@ -175,9 +101,9 @@ def finite_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: Place) -
     e_xx, e_yy, e_xy = (isochoric * (one - part * c) for one, c in zip(half, C))
     e_zz = -isochoric * part
     square = e_xx**2 + e_yy**2 + e_zz**2 + 2 * e_xy**2
-    within = WITHIN * (J_rate - J_0_rate[..., None]) ** 2
+    within = WITHIN * (J_rate - J_0_rate) ** 2
     distortion = (gauss.area * shear * (square + within)).sum(-1)
-    return 0.5 * bulk * centre.area * J_0_rate**2 + distortion
+    return (0.5 * bulk * centre.area * J_0_rate**2).sum(-1) + distortion
 
 
 def flow_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: Place) -> Tensor:
@@ -186,9 +112,9 @@ def flow_potential(bulk: Tensor, shear: Tensor, centre: Place, gauss: Place) -> 
     (_, J_0_rate), (_, J_rate) = volume(centre), volume(gauss)
     x, a, b, y = over(gauss.rate, gauss)
     square = x**2 + y**2 + 0.5 * (a + b) ** 2 - (x + y) ** 2 / 3
-    within = WITHIN * (J_rate - J_0_rate[..., None]) ** 2
+    within = WITHIN * (J_rate - J_0_rate) ** 2
     distortion = (gauss.area * shear * (square + within)).sum(-1)
-    return 0.5 * bulk * centre.area * J_0_rate**2 + distortion
+    return (0.5 * bulk * centre.area * J_0_rate**2).sum(-1) + distortion
 
 
 def over(A: Sequence[Tensor], place: Place) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -156,7 +156,7 @@ def contact_states(
         rate = rates[name][..., :2] if pad.nodal else _rates(rig, name, touched, state, u, force)
         for key, which in touched.items():
             law, shape = rig.contacts[key].law, rig.shape_of(key)
-            shares = pad.spread[which]
+            shares = pad.interpolation[which]
             x = rig.point_inputs(key, state, shares @ u, shares @ rate, which)
             slips = torch.zeros(force[key].shape[:-1], dtype=torch.int8)
             slips[..., which] = (PointLaw.of(interface_law(law, shape, x)).slip > 0).to(torch.int8)
@@ -172,7 +172,7 @@ def _rates(
     pad = rig.pads[name]
     f = torch.zeros_like(u)
     for key, which in touched.items():
-        shares = pad.spread[which]
+        shares = pad.interpolation[which]
         at = shares @ u
         x = rig.point_inputs(key, state, at, torch.zeros_like(at), which)
         frame = moving_frame(rig.shape_of(key), *point_place(x))

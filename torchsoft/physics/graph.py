@@ -24,7 +24,7 @@ from torchsoft.physics.contact import (
     relative_motion,
     turned,
 )
-from torchsoft.physics.elements import Quadrilateral
+from torchsoft.physics.mesh.element import QUADRILATERAL
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import GROUND, Block, Junction, Port, Transformer, net_efforts
 from torchsoft.physics.names import check_names
@@ -494,15 +494,17 @@ class Graph(nn.Module):
         """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises
         `NoRates` where Newton's method does not converge."""
         pad = self.pads[name]
-        law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
+        law = lambda rate: self.point_forces(own, state, pad.interpolation @ u, rate)
         if pad.nodal:
             return self._field_rates(name, state, 0, law if own else None)
         free, P = free_rates(pad, state.pads[name], 0.0)
         if not own:
             return free
         with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
-            first = law(torch.zeros_like(pad.spread @ free))
-        F, left = contact_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first)
+            first = law(torch.zeros_like(pad.interpolation @ free))
+        F, left = contact_forces(
+            P, pad.interpolation, free, law, RATE_TOLERANCE, RATE_ITERATIONS, first
+        )
         self._check_rates(name, left)
         return free + under_forces(P, F)
 
@@ -518,7 +520,7 @@ class Graph(nn.Module):
         under the forces of a law of contact points, or of a branch. No dashpot is between two of
         them."""
         pad, part = self.pads[name], state.pads[name]
-        at, dofs = pad.at_corners(part), Quadrilateral.dofs
+        at, dofs = pad.at_corners(part), QUADRILATERAL.dofs
         own = slice(dofs * field, dofs * (field + 1))
         others = own.start, at.shape[-1] - own.stop
         internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., own]
@@ -547,7 +549,7 @@ class Graph(nn.Module):
         contact = self.contacts[key]
         pad, shape = self.pads[contact.pad], self.shape_of(key)
         r_B, _ = self.base_motion(contact.pad, state)
-        x = self.point_inputs(key, state, pad.spread @ u, pad.spread @ u_dot)
+        x = self.point_inputs(key, state, pad.interpolation @ u, pad.interpolation @ u_dot)
         (d, theta), angle = point_place(x), r_B[..., 2, None]
         local = moving_frame(shape, d, theta)
         n, moment_arm = turned(local.n, angle), turned(d, angle)
@@ -557,7 +559,7 @@ class Graph(nn.Module):
             {
                 contact.body: Block(R),
                 f"{contact.body}_spin": Block(arm),
-                f"pad_{contact.pad}": Block(-R, pad.spread),
+                f"pad_{contact.pad}": Block(-R, pad.interpolation),
             }
         )
         frame = Frame(moment_arm, n, cross(n), local.g)
@@ -586,7 +588,7 @@ class Graph(nn.Module):
             blocks[f"{pad.base}_spin"] = Block(
                 -turned(cross(moment_arm), -angle)[..., None]
             )  # (35)
-        return Port(Transformer(blocks), effort, pad.elements(name))
+        return Port(Transformer(blocks), effort, pad.bond_elements(name))
 
     def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:
         """Weights and actuators, which are sources unless they resist."""

@@ -29,11 +29,11 @@ class Junction(NamedTuple):
 
 class Block(NamedTuple):
     """One junction's modulus: matrix (..., bonds or 1, m, width), after an interpolation of the
-    junction's nodes at the bonds, spread (bonds, nodes); None where bonds are nodes, or the
+    junction's nodes at the bonds, interpolation (bonds, nodes); None where bonds are nodes, or the
     junction has a single node."""
 
     matrix: Tensor
-    spread: Tensor | None = None
+    interpolation: Tensor | None = None
 
 
 class Transformer:
@@ -45,8 +45,8 @@ class Transformer:
     def flow(self, flows: Mapping[str, Tensor]) -> Tensor:
         """f = sum_j T_j v_j."""
         total = 0.0
-        for name, (matrix, spread) in self.blocks.items():
-            v = flows[name] if spread is None else spread @ flows[name]
+        for name, (matrix, interpolation) in self.blocks.items():
+            v = flows[name] if interpolation is None else interpolation @ flows[name]
             total = total + (matrix @ v[..., None])[..., 0]
         assert isinstance(total, Tensor)
         return total
@@ -54,10 +54,10 @@ class Transformer:
     def effort(self, e: Tensor, junctions: Mapping[str, Junction]) -> dict[str, Tensor]:
         """T_j^T e for every junction j, each shaped like that junction's flow."""
         out = {}
-        for name, (matrix, spread) in self.blocks.items():
+        for name, (matrix, interpolation) in self.blocks.items():
             back = (matrix.mT @ e[..., None])[..., 0]
-            if spread is not None:
-                back = spread.mT @ back
+            if interpolation is not None:
+                back = interpolation.mT @ back
             elif junctions[name].nodes == 1:
                 back = back.sum(-2, keepdim=True)
             out[name] = back

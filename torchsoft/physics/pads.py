@@ -20,11 +20,7 @@ from torch.utils.checkpoint import checkpoint
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import number, tensor, whole
-from torchsoft.physics.elements import (
-    element_constants,
-    element_energy,
-    element_potential,
-)
+from torchsoft.physics.elements import element_energy, element_potential
 from torchsoft.physics.hyperelastic import Hyperelastic, again, described, plane
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import (
@@ -35,7 +31,12 @@ from torchsoft.physics.mesh import (
     lame_moduli,
     unit_compliance,
 )
-from torchsoft.physics.mesh.mesh import gradients
+from torchsoft.physics.mesh.element import (
+    QUADRILATERAL,
+    Element,
+    element_constants,
+    gradients,
+)
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import StateBlock
 from torchsoft.quantity import Length, Quantity, Ratio, check_declared, quantities
@@ -93,6 +94,10 @@ class Pad(nn.Module):
             for name, ratio in (("E_ratio", E_ratio), ("tau_ratio", tau_ratio))
         )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
+        if self.nodal and mesh.element is not QUADRILATERAL:
+            raise NotImplementedError(
+                "a pad that is inertial or at finite strain needs a mesh of bilinear quadrilaterals"
+            )
         kept = np.arange(len(mesh.free)) if self.nodal else mesh.surface
         self.angle, self.mirrored = float(angle), bool(mirrored)
         c, s = np.cos(angle), np.sin(angle)
@@ -107,8 +112,8 @@ class Pad(nn.Module):
         own = mesh.surface if self.nodal else np.arange(len(kept))
         self.register_buffer("surface", torch.from_numpy(own.copy()), persistent=False)
         self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
-        spread = shape_functions(own[self.point_nodes], self.point_shares, len(kept))
-        self.register_buffer("spread", torch.from_numpy(spread), persistent=False)
+        interpolation = shape_functions(own[self.point_nodes], self.point_shares, len(kept))
+        self.register_buffer("interpolation", torch.from_numpy(interpolation), persistent=False)
 
     def remeshed(self, finer: int, points: int) -> "Pad":
         """The same pad of `finer` times as many elements each way, with so many contact points an
@@ -181,12 +186,12 @@ class Pad(nn.Module):
         """Kelvin elements of the chain."""
         return self.material.branches + len(self.material.added)
 
-    spread: Tensor
+    interpolation: Tensor
     """Shape functions of the nodes in the state at the contact points (points, nodes)."""
 
     def at_points(self, x: Tensor) -> Tensor:
         """Nodal vectors (..., nodes, 2) at the contact points (..., points, 2)."""
-        return x[..., self.surface, :] if self.points == 0 else self.spread @ x
+        return x[..., self.surface, :] if self.points == 0 else self.interpolation @ x
 
     @property
     def nodes(self) -> int:
@@ -224,7 +229,7 @@ class Pad(nn.Module):
     @property
     def point_positions(self) -> Tensor:
         """Undeformed places of the contact points in the base's frame (points, 2) [m]."""
-        return self.spread @ self.positions
+        return self.interpolation @ self.positions
 
     @property
     def point_coordinates(self) -> Array:
@@ -266,7 +271,7 @@ class Pad(nn.Module):
                 "take a massless pad of a linear material"
             )
 
-    def elements(self, name: str) -> tuple[str, ...]:
+    def bond_elements(self, name: str) -> tuple[str, ...]:
         """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
         elements of its chain, or of its strain energy W."""
         if isinstance(self.material, Hyperelastic):
@@ -278,7 +283,11 @@ class Pad(nn.Module):
     def masses(self) -> Tensor:
         """Lumped mass of each node that moves [kg], (nodes,); the bonded nodes' masses are left
         out, as in the paper."""
-        return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
+        return (
+            self.material.rho
+            * self.material.depth
+            * torch.from_numpy(self.mesh.areas[self.mesh.free])
+        )
 
     def factors(self) -> Tensor:
         """Numbers (4 + 2 branches,) of the elements besides the material's energy, as
@@ -318,19 +327,19 @@ class Pad(nn.Module):
     def element_forces(self, u: Tensor, rate: Tensor | None = None) -> Tensor:
         """Forces (..., elements, 8 fields) [N] on the corners of a nodal pad's elements, by default
         at rest."""
-        u, still = torch.broadcast_tensors(u, torch.zeros_like(u) if rate is None else rate)
+        u, velocity = torch.broadcast_tensors(u, torch.zeros_like(u) if rate is None else rate)
         recorded = torch.is_grad_enabled()
         with torch.enable_grad():
             if not (recorded and u.requires_grad):
                 u = u.detach().requires_grad_()
-            if not (recorded and still.requires_grad):
-                still = still.detach().requires_grad_()
-            given = self.element_inputs(u, still)
+            if not (recorded and velocity.requires_grad):
+                velocity = velocity.detach().requires_grad_()
+            given = self.element_inputs(u, velocity)
             energy = element_energy(*given).sum()
             (force,) = torch.autograd.grad(energy, u, create_graph=recorded, retain_graph=True)
             if rate is not None:
                 potential = element_potential(*given).sum()
-                (viscous,) = torch.autograd.grad(potential, still, create_graph=recorded)
+                (viscous,) = torch.autograd.grad(potential, velocity, create_graph=recorded)
                 force = force + viscous
         return force
 
@@ -379,17 +388,19 @@ class Pad(nn.Module):
 
     @cached_property
     def corners(self) -> Index:
-        """Dofs of the corners of every element (elements, 8), -1 where they are bonded."""
+        """Dofs of the nodes of every element (elements, dofs), -1 where they are bonded."""
         number = np.full(len(self.mesh.nodes), -1)
         number[self.mesh.free] = np.arange(len(self.mesh.free))
         node = number[self.mesh.elements]
-        dofs = np.stack((2 * node, 2 * node + 1), -1).reshape(len(node), 8)
+        dofs = np.stack((2 * node, 2 * node + 1), -1).reshape(len(node), -1)
         return np.where(dofs < 0, -1, dofs)
 
     @property
     def constants(self) -> Array:
-        """Constants of every element (elements, 45) in the base's frame."""
-        return constants_of(self.placed(self.mesh.nodes)[self.mesh.elements].tobytes())
+        """Constants of every element (elements, constants) in the base's frame."""
+        return constants_of(
+            self.mesh.element, self.placed(self.mesh.nodes[self.mesh.elements]).tobytes()
+        )
 
     # Fields inside of the pad, (..., mesh nodes or elements, components), in the pad's own axes.
 
@@ -416,7 +427,7 @@ class Pad(nn.Module):
     def surface_points(self, u: Array) -> Array:
         """Places (..., points, 2) [m] of the contact points in the frame of the base, of
         displacements u (..., nodes, 2) [m] as a run records them."""
-        return (self.spread @ (self.positions + torch.from_numpy(u))).numpy()
+        return (self.interpolation @ (self.positions + torch.from_numpy(u))).numpy()
 
     def gradient(self, displacement: Array) -> Array:
         """F (..., elements, 2, 2) at the centres of the elements, of displacements of all nodes."""
@@ -496,37 +507,39 @@ def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, Index, Array]:
 
 @lru_cache(maxsize=8)
 def slopes(mesh: Mesh) -> Array:
-    """Gradients (elements, 4, 2) [1/m] of the shape functions at the centres of the elements."""
-    return gradients(mesh.nodes[mesh.elements], 0.0, 0.0)[1]
+    """Gradients (elements, nodes, 2) [1/m] of the shape functions at the elements' centres."""
+    return gradients(mesh.element, mesh.nodes[mesh.elements], 0.0, 0.0)[0]
 
 
 @lru_cache(maxsize=8)
-def constants_of(corners: bytes) -> Array:
-    """Constants of elements with corners (elements, 4, 2) [m]."""
-    return element_constants(np.frombuffer(corners).reshape(-1, 4, 2))
+def constants_of(element: Element, nodes: bytes) -> Array:
+    """Constants of elements with nodes (elements, nodes, 2) [m]."""
+    return element_constants(element, np.frombuffer(nodes).reshape(-1, element.nodes, 2))
 
 
 def shape_functions(nodes: Any, shares: Array, count: int) -> Array:
-    """Shape functions of `count` nodes at points (points, count), from the two nodes of every point
-    (points, 2) and those of these."""
+    """Shape functions of `count` nodes at points (points, count), from the nodes of every point
+    (points, side) and those of these."""
     out = np.zeros((len(nodes), count))
     np.add.at(out, (np.arange(len(nodes))[:, None], nodes), shares)
     return out
 
 
 def contact_points(mesh: Mesh, points: int) -> tuple[Any, Array, Array]:
-    """Two surface nodes of every contact point (points, 2), their shape functions there, and the
+    """Surface nodes of every contact point (points, side), their shape functions there, and the
     length of surface that the point stands for [m]."""
-    count = len(mesh.surface)
+    count, side = len(mesh.surface), mesh.element.side
     if points == 0:
-        nodes = np.stack((np.arange(count), np.arange(count)), -1)
-        return nodes, np.tile([1.0, 0.0], (count, 1)), mesh.tributary
-    xi, weight = np.polynomial.legendre.leggauss(points)
-    spacing = np.linalg.norm(np.diff(mesh.nodes[mesh.free[mesh.surface]], axis=0), axis=1)
-    left = np.repeat(np.arange(count - 1), points)
-    right = np.tile(0.5 * (1 + xi), count - 1)
-    lengths = np.repeat(spacing, points) * np.tile(0.5 * weight, count - 1)
-    return np.stack((left, left + 1), -1), np.stack((1 - right, right), -1), lengths
+        nodes = np.tile(np.arange(count)[:, None], side)
+        return nodes, np.tile(np.eye(side)[0], (count, 1)), mesh.tributary
+    own = np.arange(0, count - 1, side - 1)[:, None] + np.arange(side)  # (sides, side)
+    places, shares, lengths = mesh.nodes[mesh.free[mesh.surface]][own], [], []
+    for xi, weight in zip(*np.polynomial.legendre.leggauss(points)):
+        functions, slopes = mesh.element.functions(xi, -1.0)
+        shares.append(functions[:side])
+        lengths.append(weight * np.linalg.norm(slopes[:side, 0] @ places, axis=-1))
+    nodes = np.repeat(own, points, 0)
+    return nodes, np.tile(shares, (len(own), 1)), np.stack(lengths, -1).ravel()
 
 
 # Massless pads: the relation between nodal forces and rates.

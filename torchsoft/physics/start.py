@@ -183,8 +183,7 @@ def pressed(
         places[name] = at_height(places[name], height)
     if any(value != TOUCH for value in presses.values()):
         free = {**rests} | {name: sorted({*rests.get(name, ()), 1}) for name in pushed}
-        still = no_signals(rig)
-        places = resting(rig, places, free, signals=still, actuators=(), pushed=pushed)
+        places = resting(rig, places, free, signals=no_signals(rig), actuators=(), pushed=pushed)
     return places
 
 
@@ -273,12 +272,12 @@ def upon(rig: Graph, pose: Mapping[str, Tensor], body: str) -> Tensor:
     of Newton's method with a graph after those without. Raises `NoPlace` where they touch
     nothing."""
     own = [key for key, one in rig.contacts.items() if rig.pads[one.pad].base == body]
-    still = {name: torch.zeros_like(at) for name, at in pose.items()}
+    at_rest = {name: torch.zeros_like(at) for name, at in pose.items()}
 
     def gap(y: Tensor) -> Tensor:
         """Distance [m] to what is touched first."""
         at = {**pose, body: at_height(pose[body], y)}
-        state = State({}, unstretched(rig, ()), at, {}, still)
+        state = State({}, unstretched(rig, ()), at, {}, at_rest)
         deepest = []
         for key in own:
             pad = rig.pads[rig.contacts[key].pad]

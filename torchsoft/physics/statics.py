@@ -88,15 +88,15 @@ def settled(
     check_given("pose", pose, dict.fromkeys(rig.bodies, 3))
     check_given("velocity", velocity, dict.fromkeys(rig.bodies, 3))
     check_given("stretch", stretch, rig.point_counts)
-    still = State(
+    at_rest = State(
         {},
         dict(stretch),
         dict(pose),
         {},
         {name: torch.zeros_like(v) for name, v in velocity.items()},
     )
-    pads = {name: carried(rig, name, still) for name in rig.pads}
-    moving = still._replace(velocity=dict(velocity))
+    pads = {name: carried(rig, name, at_rest) for name in rig.pads}
+    moving = at_rest._replace(velocity=dict(velocity))
     inertial = [name for name, pad in rig.pads.items() if pad.inertial]
     rates = {name: carried_along(rig, name, moving, pads[name]) for name in inertial}
     return rig.pack(moving._replace(pads=pads, rates=rates), t, reference)
@@ -136,7 +136,7 @@ def carried(rig: Graph, name: str, state: State, known: dict[str, Tensor] | None
     elif own:
         law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
         found, left = contact_forces(
-            pad.compliance(), pad.spread, undeformed, law, RESIDUAL, SETTLING
+            pad.compliance(), pad.interpolation, undeformed, law, RESIDUAL, SETTLING
         )
     if not left <= RESIDUAL:
         raise NoEquilibrium(
@@ -198,8 +198,8 @@ def standing(
 ) -> Tensor:
     """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled
     around them and no point stretched, at t [s]. Differentiable and raises as `settled`."""
-    still = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
-    return settled(rig, pose, still, unstretched(rig, ()), t, reference)
+    at_rest = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
+    return settled(rig, pose, at_rest, unstretched(rig, ()), t, reference)
 
 
 @one_torch_thread()
@@ -215,8 +215,8 @@ def standing_state(
     """State of bodies that stand at `pose` (..., 3) [m, m, rad], with pads settled around them from
     displacements `known` nearby (see `carried`), and no point stretched."""
     batch = next(iter(pose.values())).shape[:-1]
-    still = {name: torch.zeros(*batch, 3, dtype=torch.float64) for name in rig.bodies}
-    state = State({}, unstretched(rig, batch), dict(pose), {}, still)
+    at_rest = {name: torch.zeros(*batch, 3, dtype=torch.float64) for name in rig.bodies}
+    state = State({}, unstretched(rig, batch), dict(pose), {}, at_rest)
     return state._replace(pads={name: carried(rig, name, state, known) for name in rig.pads})
 
 

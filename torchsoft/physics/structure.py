@@ -35,16 +35,13 @@ class Structure:
     """Modules of a part, each once, its parameters' tensors in their order, and a `key` that is
     equal for equal structures, until something changes. `known` is False where that is not certain:
     for code that is neither this package's nor torch's, hooks, other attributes than numbers, text,
-    arrays and functions of this package. Such a part is like no other, nor like itself later. The
-    last `model` that was found for it stays with it."""
-
-    model: Any
+    arrays and functions of this package. Such a part is like no other, nor like itself later."""
 
     def __init__(self, part: nn.Module) -> None:
         self.modules: list[nn.Module] = []
         self.children: list[dict[str, int | None]] = []
         self.parameters: list[Tensor] = []
-        self.known, self.model = True, None
+        self.known = True
         self._key: list[Any] = []
         self._numbers: dict[int, int] = {}
         self._visit(part)

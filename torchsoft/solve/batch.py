@@ -167,7 +167,7 @@ def simulate_batch(
     begun: Any = y0 if starts(y0) else _rows("y0", y0)
     # a single rig is a module, single times a vector, a single start too, a single reference a
     # module
-    runs = _spread(
+    runs = _arguments(
         parameters,
         rig=(rig, isinstance(rig, nn.Module)),
         t=(t, isinstance(t, Tensor) and t.ndim == 1),
@@ -260,7 +260,7 @@ def _rows(name: str, given: Any) -> Any:
     return None if given is None else tensor(name, given)
 
 
-def _spread(
+def _arguments(
     parameters: Mapping[str, Tensor] | None, **shared: tuple[Any, bool]
 ) -> list[dict[str, Any]]:
     """The arguments of every run, by name, from those of all runs, each with whether it is given

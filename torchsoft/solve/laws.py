@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchsoft.codegen import Law, UnknownOperation, compile_law
 from torchsoft.codegen.emit import check_pointwise
-from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.graph import ScalarGraph
 from torchsoft.codegen.stops import left_out
 from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import (
@@ -27,9 +27,10 @@ from torchsoft.physics.contact import (
     slip_of,
     stored_law,
 )
-from torchsoft.physics.elements import Quadrilateral, element_potentials
+from torchsoft.physics.elements import element_potentials
 from torchsoft.physics.hyperelastic import Hyperelastic, invariants
 from torchsoft.physics.material import Material
+from torchsoft.physics.mesh.element import QUADRILATERAL
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.shapes import Shape
@@ -110,7 +111,7 @@ def compiled_law(
         example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
 
         def expressions() -> tuple[Any, ...]:
-            graph = Graph()
+            graph = ScalarGraph()
             outputs = traced(graph, law, example, names)
             return (
                 tuple(graph.ops),
@@ -404,10 +405,10 @@ def element_law(
     own = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
     parameters: dict[str, Tensor] = {f"material.{key}": value for key, value in own.items()}
     parameters["factors.values"] = factors
-    corners = Quadrilateral.dofs * fields
+    corners = QUADRILATERAL.dofs * fields
     try:
         law = compiled_law(
-            parameters, element, 2 * corners + Quadrilateral.constants, corners, 2 * corners,
+            parameters, element, 2 * corners + QUADRILATERAL.constants, corners, 2 * corners,
             conjugates=corners, lanes=LANES, material=material, factors=Factors(factors),
         )  # fmt: skip
     except UnknownOperation as error:

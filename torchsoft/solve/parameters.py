@@ -19,7 +19,8 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.structure import Structure, copied, described
 from torchsoft.physics.validity import check_place, check_values, ordinary
 from torchsoft.solve.kernel.table import Array
-from torchsoft.solve.model import computed, model_of, prepared_laws, prepared_shapes
+from torchsoft.solve.model import model_of
+from torchsoft.solve.rig_arrays import computed, prepared
 from torchsoft.solve.steps import Followed, own_units
 
 
@@ -55,20 +56,22 @@ class Parameters:
         differentiable = differentiable or not structure.known  # whose gradients are judged
         followed = rig.reference if reference is None else reference
         if not ordinary(given):
-            self._refuse(structure.copy(given)[0], rig.reference)
+            odd = structure.copy(given)[0]
+            odd._modules["reference"] = rig.reference
+            check_values(odd)  # which names the parameter
         apart = independent() if differentiable else nullcontext()
         with torch.inference_mode(False), torch.set_grad_enabled(differentiable), apart:
-            theta, mine = taken(structure.parameters, given, differentiable)
-            own = [mine[id(x)] for x in structure.parameters]
+            theta, copies = taken(structure.parameters, given, differentiable)
+            own = [copies[id(x)] for x in structure.parameters]
             self.model = model = model_of(structure, own)
             modules = model.structure.copy(own, apart=False)
             self.rig: Rig = modules[0]
             touched = lambda one: not values.keys().isdisjoint(map(id, one.parameters()))
             change = lambda one: differentiable or (values and touched(one))
-            self.reference = copy_of(followed, mine, values) if change(followed) else followed
+            self.reference = copy_of(followed, copies, values) if change(followed) else followed
             self.rig._modules["reference"] = (
                 self.reference if followed is rig.reference
-                else copy_of(rig.reference, mine, values) if change(rig.reference)
+                else copy_of(rig.reference, copies, values) if change(rig.reference)
                 else rig.reference
             )  # fmt: skip
             self._evaluate(modules, theta)
@@ -84,7 +87,7 @@ class Parameters:
                 return
         if not model.within(modules, values):
             check_values(self.rig)
-        made = computed(self.rig, prepared_shapes(self.rig), prepared_laws(self.rig)).values()
+        made = computed(self.rig, *prepared(self.rig)).values()
         self.vector = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
         self.p, self.units = self.vector[model.index], own_units(self.rig, model.smallest)
         self.numbers = self.p.detach().numpy()
@@ -102,17 +105,12 @@ class Parameters:
         """Values (.,) of a parameter, by its name in the module or the rig file."""
         return self.vector[self.model.places[name]]
 
-    def _refuse(self, rig: Rig, reference: Reference) -> None:
-        """Raises the `ValueError` that names a parameter which is no ordinary tensor."""
-        rig._modules["reference"] = reference
-        check_values(rig)
-
     @cached_property
     def system(self) -> Any:
         """The rig's arrays."""
         return self.model.system(self.numbers.copy())
 
-    def followed(self, reference: Reference, origin: float) -> Followed:
+    def kernel_signals(self, reference: Reference, origin: float) -> Followed:
         """A reference as the kernels evaluate it, with time counted from `origin` [s]."""
         fixed = [float(one.detach()) for one in self.rig.fixed_values]
         structure = Structure(reference)
@@ -155,10 +153,10 @@ def taken(
 ) -> tuple[Tensor, dict[int, Tensor]]:
     """Copies of the values `given` for some tensors: in one vector, and by the tensors' id."""
     if differentiable:
-        mine = {id(x): value for x, value in zip(tensors, given)}
-        mine = {key: value.clone() for key, value in mine.items()}
-        flat = [mine[id(x)].reshape(-1) for x in tensors]
-        return torch.cat([torch.zeros(0, dtype=torch.float64), *flat]), mine
+        copies = {id(x): value for x, value in zip(tensors, given)}
+        copies = {key: value.clone() for key, value in copies.items()}
+        flat = [copies[id(x)].reshape(-1) for x in tensors]
+        return torch.cat([torch.zeros(0, dtype=torch.float64), *flat]), copies
     if given and not any(x.ndim for x in given):  # scalars, as most parameters are
         theta = torch.stack([*given])
         return theta, dict(zip(map(id, tensors), theta.unbind()))
@@ -169,9 +167,9 @@ def taken(
 
 
 def copy_of(
-    reference: Reference, mine: dict[int, Tensor], values: Mapping[int, Tensor]
+    reference: Reference, copies: dict[int, Tensor], values: Mapping[int, Tensor]
 ) -> Reference:
-    """A reference with copies of its parameters, those `mine` where they are the rig's too, and
+    """A reference with copies of its parameters, those `copies` where they are the rig's too, and
     `values` in the place of some. Signals that are not this package's are kept as they are."""
     foreign = [one for one in reference.signals.values() if not polynomial(one)]
     known: dict[int, nn.Module] = {id(one): one for one in foreign}
@@ -181,8 +179,8 @@ def copy_of(
     for one in known.values():
         if one not in foreign:
             for name, x in one._parameters.items():
-                if x is not None and id(x) not in mine:
-                    mine[id(x)] = values.get(id(x), x).clone()
+                if x is not None and id(x) not in copies:
+                    copies[id(x)] = values.get(id(x), x).clone()
                 own: dict[str, Any] = one._parameters
-                own[name] = x if x is None else mine[id(x)]
+                own[name] = x if x is None else copies[id(x)]
     return out  # pyright: ignore[reportReturnType]

@@ -188,7 +188,7 @@ class ImplicitStepper:
         pass. Raises `SimulationFailed`.
         """
         self.origin, times = float(t[0]), t.numpy() - float(t[0])
-        self.followed = self._motion or self.parameters.followed(self.reference, self.origin)
+        self.followed = self._motion or self.parameters.kernel_signals(self.reference, self.origin)
         self._shortest = min(SHORTEST, PART * times[-1])
         room, out = self.parameters.model.take(self.parameters.numbers), self._progress(len(t))
         now = RunState(room, y0.numpy().copy(), out, segments, tape_bytes, outputs_too)
@@ -316,7 +316,7 @@ class ImplicitStepper:
         """Room for so many outputs."""
         widths = self.parameters.model.widths
         y, integrals, recorded, rate = (np.zeros((rows, width)) for width in widths)
-        signals = np.zeros((rows, self.parameters.model.followed, 2))
+        signals = np.zeros((rows, self.parameters.model.signal_count, 2))
         return Progress(y, integrals, recorded, rate, signals, np.zeros(rows), origin=self.origin)
 
     def tapes(self, segment: Segment, room: Any) -> tuple[Any, Any]:

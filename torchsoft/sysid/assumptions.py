@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any, Literal
 
 from torchsoft.physics.contact import SmoothSlip
-from torchsoft.physics.extensions import extensions, undelayed
 from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.motion import Sampled
 from torchsoft.physics.parts import PD
@@ -39,6 +38,7 @@ from torchsoft.sysid.alternatives import (
     turned,
     zoomed,
 )
+from torchsoft.sysid.extensions import extensions, undelayed
 from torchsoft.sysid.initial_state import SETTLE, Standing
 from torchsoft.sysid.prediction import partner
 from torchsoft.sysid.recording import Recording

@@ -17,12 +17,12 @@ from torch import Tensor
 from torchsoft.display import suggestion
 from torchsoft.physics.channels import measurable
 from torchsoft.physics.contact import cross, point_place, slip_of
-from torchsoft.physics.extensions import undelayed
 from torchsoft.physics.parts import COORDINATES, PD, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.start import above
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, resting, settled
+from torchsoft.sysid.extensions import undelayed
 from torchsoft.sysid.initial_state import (
     LEAD,
     PREFIX,
@@ -284,7 +284,7 @@ def stretches(rig: Rig, bodies: Mapping[str, Normal], at: float, time: float) ->
     for name, F_N in loads(rig, state).items():
         contact, weight = rig.contacts[name], rig.weight(name)
         pad = rig.pads[contact.pad]
-        loaded = np.flatnonzero((pad.spread[F_N > 0] != 0).any(0).numpy())
+        loaded = np.flatnonzero((pad.interpolation[F_N > 0] != 0).any(0).numpy())
         if not len(loaded):
             continue
         places = np.sort(along(pad, pad.positions[pad.surface]))

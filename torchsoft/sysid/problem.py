@@ -10,9 +10,9 @@ import numpy as np
 
 from torchsoft.display import Shown, amount, suggestion
 from torchsoft.physics.channels import Touch
-from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
 from torchsoft.sysid.assumptions import Suspect
+from torchsoft.sysid.extensions import extensions
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
     FailedRun,

@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from torchsoft.display import suggestion
 from torchsoft.physics.channels import Touch, measurable, units
-from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
+from torchsoft.sysid.extensions import extend
 from torchsoft.sysid.initial_state import InitialState, Start, StartCoordinate
 
 Array = NDArray[np.float64]

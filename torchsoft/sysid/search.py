@@ -3,7 +3,8 @@
 1. Score tests of all suspects order them: those that would explain most come first, and those with
    costly runs last.
 2. Successive halving: every suspect of a bracket gets one step; then the best third goes on with
-   three times as many evaluations, until a few finalists are left.
+   three times as many evaluations, until a few finalists are left. Suspects that explain as much by
+   their score tests are finalists, too.
 3. Finalists are fitted until they converge, on fine steps. The search ends after a bracket in which
    one explains the misfit, and when refits took all of the effort.
 """
@@ -221,12 +222,14 @@ def search(
         size = max(BRACKET, sum(tests[one.name].gain >= least for one in queue if not one.costly))
         while queue and end.runner.work < most:
             bracket, queue = queue[:size], queue[size:]
-            fits, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
+            first, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
+            fits = first
             while len(fits) > FINALISTS:
                 kept = best_of(fits, linear)
                 bar.set_description(f"{len(kept)} suspects, {evaluations} evaluations each")
                 fits = {one: carried_on(fits[one], evaluations) for one in kept}
                 evaluations *= KEPT
+            fits = comparable(first, tests, fits) | fits
             dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
             yield from ((test, None) for test in dropped)
             explained = False
@@ -300,6 +303,19 @@ def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
     if gains[kept[0]] < max(NEARLY * (linear.square - linear.dof), EVIDENT):
         return kept
     return [one for one in kept if gains[one] >= RIVAL * gains[kept[0]]]
+
+
+def comparable(
+    first: Mapping[Suspect, Fit], tests: Mapping[str, AssumptionTest], fits: Mapping[Suspect, Fit]
+) -> dict[Suspect, Fit]:
+    """The first steps with suspects that explain as much by their score tests as the best of some
+    fits: a few evaluations do not exclude them."""
+    most = min((fit.square for fit in fits.values()), default=0.0) + COMPARABLE
+    return {
+        one: fit
+        for one, fit in first.items()
+        if tests[one.name].passed and tests[one.name].left < most
+    }
 
 
 def carried_on(fit: Fit, evaluations: int) -> Fit:

@@ -510,14 +510,14 @@ def _judged(
 
 def _agreed(found: Mapping[float, float]) -> tuple[float, float]:
     """The difference and its uncertainty, from the two neighbouring lengths that agree best: their
-    distance, or the noise of shorter lengths, which falls with the length, since noise may agree by
-    chance."""
+    distance, or twice the noise of shorter lengths, which falls with the length, since noise may
+    agree by chance and few lengths show less of it than there is."""
     best, noise = (np.nan, np.inf), 0.0
     for a, b in pairwise(sorted(found)):
         spread = abs(found[a] - found[b])
         if np.isfinite(spread):
             noise = max(noise, a * spread)
-            uncertainty = max(spread, noise / b)
+            uncertainty = max(spread, 2 * noise / b)
             if uncertainty < best[1]:
                 best = found[b], uncertainty
     return best

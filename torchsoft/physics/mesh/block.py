@@ -15,7 +15,6 @@ from torchsoft.physics.mesh.mesh import (
     FreeMesh,
     Index,
     Mesh,
-    element_matrices,
     in_band,
     quads,
 )
@@ -115,10 +114,9 @@ class PadMesh(Mesh):
         """Numbers of the nodes on the free surface."""
         return self.edge("face")
 
-    @cached_property
-    def matrices(self) -> tuple[Array, Array, Array]:
-        """Element matrices K_lambda, K_mu, M (8, 8): all elements are alike."""
-        return element_matrices(self.nodes[self.elements[0]])
+    @property
+    def corners(self) -> Array:
+        return self.nodes[self.elements[:1]]
 
     @property
     def space(self) -> Array:
@@ -176,9 +174,9 @@ class CurvedPadMesh(PadMesh):
         R, off = abs(self.radius), x - 0.5 * self.length
         return self.height - np.sign(self.radius) * off**2 / (R + np.sqrt(R**2 - off**2))
 
-    @cached_property
-    def matrices(self) -> tuple[Array, Array, Array]:
-        return element_matrices(self.nodes[self.elements])
+    @property
+    def corners(self) -> Array:
+        return self.nodes[self.elements]
 
 
 CORE = 0.5

@@ -1,8 +1,8 @@
-"""Interface of a pad's mesh; its element, a bilinear quadrilateral, its stiffness and
-compliance."""
+"""Interface of a pad's mesh, its stiffness and compliance."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import permutations
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,7 +13,13 @@ from scipy.sparse import csgraph
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
-Array = NDArray[np.float64]
+from torchsoft.physics.mesh.element import (
+    QUADRILATERAL,
+    Array,
+    element_stiffness,
+    gradients,
+)
+
 Index = NDArray[np.int64]
 
 MEMORY = 8.0
@@ -21,9 +27,6 @@ MEMORY = 8.0
 
 
 Modulus = TypeVar("Modulus", float, Tensor)
-
-CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=np.float64)
-"""Corners of the reference square of an element."""
 
 
 def lame_moduli(E: Modulus, nu: Modulus) -> tuple[Modulus, Modulus]:
@@ -40,44 +43,6 @@ def quads(number: Index) -> Index:
     """Elements (n, 4) of a grid of nodes, anticlockwise, by the nodes' numbers (columns, rows)."""
     corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     return np.stack(corners, -1).reshape(-1, 4)
-
-
-def gradients(corners: Array, xi: float, zeta: float) -> tuple[Array, Array, Array]:
-    """Shape functions (4,) at a place of the square, their gradients (..., 4, 2) [1/m] in elements
-    of `corners` (..., 4, 2) [m], and the determinant of the map (...) [m2]."""
-    across, along = 1 + CORNERS[:, 0] * xi, 1 + CORNERS[:, 1] * zeta
-    slopes = np.stack((CORNERS[:, 0] * along, CORNERS[:, 1] * across), -1) / 4
-    J = np.swapaxes(corners, -1, -2) @ slopes  # d(x, y) / d(xi, zeta)
-    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    cofactors = np.stack((J[..., 1, 1], -J[..., 0, 1], -J[..., 1, 0], J[..., 0, 0]), -1).reshape(
-        J.shape
-    )
-    inverse = cofactors / determinant[..., None, None]
-    return across * along / 4, slopes @ inverse, determinant
-
-
-def strains(gradient: Array) -> Array:
-    """B (..., 3, 8): (e_xx, e_yy, 2 e_xy) of the nodes' displacements, dofs (x, y) node by node."""
-    B = np.zeros((*gradient.shape[:-2], 3, 8))
-    B[..., 0, 0::2], B[..., 1, 1::2] = gradient[..., 0], gradient[..., 1]
-    B[..., 2, 0::2], B[..., 2, 1::2] = gradient[..., 1], gradient[..., 0]
-    return B
-
-
-def element_matrices(corners: Array) -> tuple[Array, Array, Array]:
-    """K_lambda, K_mu (per modulus and depth) [1] and the consistent M (per density and depth) [m2],
-    each (..., 8, 8), of elements with `corners` (..., 4, 2) [m] anticlockwise."""
-    _, gradient, quarter = gradients(corners, 0.0, 0.0)
-    divergence = gradient.reshape(*gradient.shape[:-2], 8)
-    K_lambda = 4 * quarter[..., None, None] * divergence[..., :, None] * divergence[..., None, :]
-    K_mu, M, gauss = np.zeros_like(K_lambda), np.zeros_like(K_lambda), 1 / np.sqrt(3)
-    for xi in (-gauss, gauss):
-        for zeta in (-gauss, gauss):
-            N, gradient, area = gradients(corners, xi, zeta)
-            B = strains(gradient)
-            K_mu += area[..., None, None] * (np.swapaxes(B, -1, -2) @ np.diag([2.0, 2.0, 1.0]) @ B)
-            M += area[..., None, None] * np.kron(np.outer(N, N), np.eye(2))
-    return K_lambda, K_mu, M
 
 
 class Mesh:
@@ -97,6 +62,7 @@ class Mesh:
     height: Any
     elements_x: Any
     elements_y: Any
+    element: Any = QUADRILATERAL
 
     numbers: Any = "the elements of its file"
     """Arguments that say how many elements it has, for messages."""
@@ -143,32 +109,34 @@ class Mesh:
         shares = 0.5 * (np.concatenate(([0.0], lengths)) + np.concatenate((lengths, [0.0])))
         return shares[~self.bonded[self.face]]
 
-    @cached_property
-    def matrices(self) -> tuple[Array, Array, Array]:
-        """Element matrices K_lambda, K_mu, M, each (8, 8) or (elements, 8, 8)."""
-        return element_matrices(self.nodes[self.elements])
+    @property
+    def corners(self) -> Array:
+        """Places of the nodes of every element (elements, nodes, 2) [m], or of the first (1, nodes,
+        2) where all elements are alike."""
+        return self.nodes[self.elements]
 
-    def assemble(self, element: Array, all_nodes: bool = False) -> sparse.csr_array:
-        """Global matrix of element matrices (8, 8) or (elements, 8, 8), on the dofs of the free
-        nodes or of all of them."""
-        dofs = dofs_of(self.elements.ravel()).reshape(-1, 8)
-        rows, cols = np.repeat(dofs, 8, 1).ravel(), np.tile(dofs, (1, 8)).ravel()
-        entries = np.broadcast_to(element, (len(dofs), 8, 8)).ravel()
-        size = 2 * len(self.nodes)
-        full = sparse.csr_array((entries, (rows, cols)), shape=(size, size))
+    def stiffness(
+        self, lame_lambda: float, lame_mu: float, all_nodes: bool = False
+    ) -> sparse.csr_array:
+        """Global stiffness per depth, on the dofs of the free nodes or of all of them."""
+        K = element_stiffness(self.element, self.corners, lame_lambda, lame_mu)
+        dofs = dofs_of(self.elements.ravel()).reshape(len(self.elements), -1)
+        shape = *dofs.shape, dofs.shape[1]
+        row, column = (np.broadcast_to(x, shape).ravel() for x in (dofs[:, :, None], dofs[:, None]))
+        entries, size = np.broadcast_to(K, shape).ravel(), 2 * len(self.nodes)
+        full = sparse.csr_array((entries, (row, column)), shape=(size, size))
         keep = dofs_of(self.free)
         return full if all_nodes else full[keep][:, keep]
 
-    def stiffness(self, lame_lambda: float, lame_mu: float) -> sparse.csr_array:
-        """Global stiffness per depth, on the dofs of the free nodes."""
-        K_lambda, K_mu, _ = self.matrices
-        return self.assemble(lame_lambda * K_lambda + lame_mu * K_mu)
-
     @cached_property
-    def nodal_areas(self) -> Array:
-        """Lumped mass per density and depth of the free nodes [m2], shape (free,): row sums of the
-        consistent M."""
-        return self.assemble(self.matrices[2], all_nodes=True).sum(1)[::2][self.free]
+    def areas(self) -> Array:
+        """Lumped mass per density and depth of every node [m2], shape (N,)."""
+        total = np.zeros(len(self.nodes))
+        for xi, zeta, weight in self.element.distortion:
+            _, determinant = gradients(self.element, self.nodes[self.elements], xi, zeta)
+            share, _ = self.element.functions(xi, zeta)
+            np.add.at(total, self.elements, weight * abs(determinant)[:, None] * share)
+        return total
 
     @property
     def band(self) -> int:
@@ -302,7 +270,7 @@ def first_hit(start: Array, direction: Array, line: Array) -> float:
 def in_band(nodes: Array, elements: Index) -> Index:
     """The order of the nodes in which those of one element are close to each other (reverse
     Cuthill-McKee)."""
-    pairs = np.array([(a, b) for a in range(4) for b in range(4) if a != b])
+    pairs = np.array([*permutations(range(elements.shape[1]), 2)])
     rows, cols = elements[:, pairs[:, 0]].ravel(), elements[:, pairs[:, 1]].ravel()
     graph = sparse.csr_array((np.ones(len(rows)), (rows, cols)), shape=(len(nodes), len(nodes)))
     return reverse_cuthill_mckee(sparse.csr_matrix(graph), symmetric_mode=True).astype(np.int64)

@@ -13,16 +13,15 @@ from scipy.sparse.csgraph import connected_components
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import places
+from torchsoft.physics.mesh.element import CORNERS, gradients
 from torchsoft.physics.mesh.files import read_quads
 from torchsoft.physics.mesh.mesh import (
-    CORNERS,
     Array,
     FreeMesh,
     Index,
     Mesh,
     boundary,
     edges,
-    gradients,
     in_band,
     quads,
 )
@@ -86,7 +85,7 @@ class QuadMesh(FreeMesh):
             raise ValueError(f"`quads` must be numbers of the {len(self.points)} points, from 0 on")
         nodes, elements = self.nodes, self.elements
         worst = np.min(
-            [gradients(nodes[elements], *corner)[2] for corner in CORNERS.tolist()], axis=0
+            [gradients(self.element, nodes[elements], *at)[1] for at in CORNERS.tolist()], axis=0
         )
         if not worst.min() > 0:
             raise ValueError(

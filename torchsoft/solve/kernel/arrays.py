@@ -44,6 +44,9 @@ may touch: one that flies would else be through the pad between two steps."""
 AXES = 2
 """Of the plane: components of a vector."""
 
+SIDE = 2
+"""Nodes of the side of an element, with which a contact point on it moves."""
+
 PAIR = 6
 """Coordinates of a contact: of its body and of its pad's base. The law of relative motion has as
 inputs these, their rates and the wrench, and as outputs the relative pose, its rates and the loads
@@ -205,8 +208,9 @@ class Contacts(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Per contact point: its contact, undeformed place in the base's frame, weight, two surface
-    nodes and their shape functions there; y_start of its states."""
+    """Per contact point: its contact, undeformed place in the base's frame, weight, the surface
+    nodes (points, `SIDE`) of the element's side that it is on and their shape functions there;
+    y_start of its states."""
 
     contact: Index
     X: Matrix
@@ -476,23 +480,6 @@ class Run(NamedTuple):
     h: Array
     signals: Hypercube
     counts: Index
-
-
-@table
-class Rates(NamedTuple):
-    """Arguments of `rates`."""
-
-    rig: Annotated[Any, System]
-    work: Annotated[Any, Work]
-    followed: Signals
-    limits: Limits
-    t: float
-    y: Array
-    signals: Cube
-    powers: Array
-    wrenches: Matrix
-    out: Array
-    converged: Index
 
 
 @table

@@ -18,7 +18,7 @@ S by positions, H by rates of the stage, which move positions by a h.
 from typing import Any
 
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.arrays import AXES, MOTION, PAIR, WRENCH
+from torchsoft.solve.kernel.arrays import AXES, MOTION, PAIR, SIDE, WRENCH
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 from torchsoft.solve.kernel.linear import add, bounds, put, solve_dense
 from torchsoft.solve.kernel.table import Array
@@ -58,13 +58,12 @@ def load(rig: Any, work: Any, c: int) -> None:
 @compiled
 def at_point(rig: Any, k: int, nodal: Array) -> tuple[float, float]:
     """A nodal quantity (nodes, 2) at point k."""
-    n0, n1, N0, N1 = (
-        rig.point_node[k, 0],
-        rig.point_node[k, 1],
-        rig.point_N[k, 0],
-        rig.point_N[k, 1],
-    )
-    return N0 * nodal[n0, 0] + N1 * nodal[n1, 0], N0 * nodal[n0, 1] + N1 * nodal[n1, 1]
+    x = y = 0.0
+    for j in range(SIDE):
+        node, N = rig.point_node[k, j], rig.point_N[k, j]
+        x += N * nodal[node, 0]
+        y += N * nodal[node, 1]
+    return x, y
 
 
 @compiled
@@ -105,7 +104,7 @@ def fill(rig: Any, work: Any, k: int, y: Array, a: float) -> None:
 @compiled
 def press(rig: Any, work: Any, k: int) -> None:
     """Add the force of point k to its nodes, in work.F."""
-    for j in range(2):
+    for j in range(SIDE):
         for r in range(2):
             work.F[rig.point_node[k, j], r] += rig.point_N[k, j] * work.out[k, r]
 
@@ -223,7 +222,7 @@ def touched_nodes(rig: Any, work: Any, pad: int) -> int:
     for node in range(work.low[pad], work.high[pad]):
         work.slot[node] = -1
     for i in range(work.actives[pad]):
-        for j in range(2):
+        for j in range(SIDE):
             node = rig.point_node[work.active[at + i], j]
             if rig.point_N[work.active[at + i], j] != 0.0 and work.slot[node] < 0:
                 work.slot[node], work.touched[first + n] = n, node
@@ -254,7 +253,7 @@ def assemble(rig: Any, work: Any, pad: int, a: float, Rv: Array) -> None:
         c = rig.point_contact[k]
         H, number = work.H[at + i], rig.contact_number[c]
         PB[:, : 2 * n] = 0.0
-        for j in range(2):
+        for j in range(SIDE):
             N = rig.point_N[k, j]
             if N != 0.0:
                 row = 2 * work.slot[rig.point_node[k, j]]
@@ -271,7 +270,7 @@ def assemble(rig: Any, work: Any, pad: int, a: float, Rv: Array) -> None:
             for other in range(PAIR):
                 if number[other] >= 0:
                     Rv[number[row], number[other]] += K[row, AXES + other]
-        for j in range(2):
+        for j in range(SIDE):
             N = rig.point_N[k, j]
             if N == 0.0:
                 continue
@@ -298,11 +297,11 @@ def residual(rig: Any, work: Any, pad: int, r: Array) -> None:
         k = work.active[at + i]
         c, H = rig.point_contact[k], work.H[at + i]
         dx = dy = 0.0
-        for j in range(2):
+        for j in range(SIDE):
             node, N = rig.point_node[k, j], rig.point_N[k, j]
             dx += N * (work.free[node, 0] - work.u_dot[node, 0])
             dy += N * (work.free[node, 1] - work.u_dot[node, 1])
-        for j in range(2):
+        for j in range(SIDE):
             if rig.point_N[k, j] != 0.0:
                 row = 2 * work.slot[rig.point_node[k, j]]
                 for o in range(2):
@@ -447,7 +446,7 @@ def restore(rig: Any, work: Any, tape: Any, row: int, a: float, recorded: bool) 
         low, high = rig.pad_node_start[pad + 1], rig.pad_node_start[pad]
         work.actives[pad] = tape.count[row, pad]
         for i in range(work.actives[pad]):
-            for j in range(2):
+            for j in range(SIDE):
                 node = rig.point_node[tape.point[row, slot + i], j]
                 low, high = min(low, node), max(high, node + 1)
         work.low[pad], work.high[pad] = min(low, high), high

@@ -13,6 +13,7 @@ from torchsoft.solve.kernel.arrays import (
     LOST,
     OFF_THE_PAD,
     PASSED_THROUGH,
+    SIDE,
 )
 from torchsoft.solve.kernel.invoke import call_value
 from torchsoft.solve.kernel.linear import bounds
@@ -149,7 +150,7 @@ def deformed(
     unless they are among those from `low` to `high`."""
     pad = rig.contact_pad[rig.point_contact[k]]
     x, z = rig.point_X[k, 0], rig.point_X[k, 1]
-    for j in range(2):
+    for j in range(SIDE):
         node, N = rig.point_node[k, j], rig.point_N[k, j]
         if N == 0.0 or node < low or node >= high:
             continue

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled, contacts
-from torchsoft.solve.kernel.arrays import AXES, LANES, PAIR, WRENCH
+from torchsoft.solve.kernel.arrays import AXES, LANES, PAIR, SIDE, WRENCH
 from torchsoft.solve.kernel.invoke import (
     call_linearise,
     call_pull,
@@ -327,11 +327,11 @@ def couple(rig: Any, work: Any, pad: int, Rv: Array) -> None:
             k = work.active[at + i]
             c, H = rig.point_contact[k], work.H[at + i]
             Dx, Dy = 0.0, 0.0
-            for j in range(2):
+            for j in range(SIDE):
                 dof, N = first + rig.nodal_surface[2 * rig.point_node[k, j]], rig.point_N[k, j]
                 Dx += N * (work.D[dof, 0] * ex + work.D[dof, 1] * ey)
                 Dy += N * (work.D[dof + 1, 0] * ex + work.D[dof + 1, 1] * ey)
-            for j in range(2):
+            for j in range(SIDE):
                 if rig.point_N[k, j] != 0.0:
                     row = 2 * work.slot[rig.point_node[k, j]]
                     for r in range(2):

@@ -28,7 +28,7 @@ import llvmlite.binding as llvm
 from platformdirs import user_cache_path
 
 from torchsoft.files import held, replacing
-from torchsoft.solve.kernel.arrays import Backward, Forward, Rates, Run
+from torchsoft.solve.kernel.arrays import Backward, Forward, Run
 from torchsoft.solve.kernel.table import address
 
 HERE = Path(__file__).parent
@@ -37,7 +37,6 @@ ENTRIES: dict[str, tuple[str, Any]] = {
     "run": ("torchsoft.solve.kernel.run", Run),
     "backward": ("torchsoft.solve.kernel.adjoint", Backward),
     "forward": ("torchsoft.solve.kernel.tangent", Forward),
-    "rates": ("torchsoft.solve.kernel.run", Rates),
 }
 """Kernels that Python calls: their module and the table that they take."""
 

@@ -23,8 +23,7 @@ from torchsoft.solve.kernel.arrays import (
 from torchsoft.solve.kernel.domain import departed, innermost
 from torchsoft.solve.kernel.invoke import call_value
 from torchsoft.solve.kernel.linear import put
-from torchsoft.solve.kernel.sources import effort
-from torchsoft.solve.kernel.step import solve_near, take_back, take_step, write_rows
+from torchsoft.solve.kernel.step import take_back, take_step, write_rows
 from torchsoft.solve.kernel.table import Array
 
 ERROR = 2.0 * abs(3.0 * GAMMA**2 - 2.0 * GAMMA**3 - 1.0 / 6.0)
@@ -256,33 +255,3 @@ def enlarge(errors: Any, y: Array) -> None:
         for i in range(errors.first[part], errors.last[part]):
             size += (y[i] - errors.origin[i]) ** 2
         errors.size[part] = max(errors.size[part], np.sqrt(size))
-
-
-AT_ONCE = 1e-18
-"""Length a h [s] of the stage: no velocity changes in it by more than rounding does."""
-
-
-@compiled
-def rates(call: Any) -> None:
-    """dy/dt of the state y at t [s] into out, of a rig whose pads are massless; converged receives
-    0 if Newton finds no forces there.
-
-    A stage of no length gives all rates; those of the velocities are a difference over its length
-    and come from the loads instead. signals (1, signals, 2) is scratch, as are powers and wrenches.
-    """
-    rig, work, y, out = call.rig, call.work, call.y, call.out
-    follow(call.followed, call.t, call.t, call.signals)
-    for i in range(rig.body_coordinate.size):
-        work.V[rig.body_coordinate[i]] = y[rig.body_V_start + i]
-    work.travelled[0] = np.inf  # the last state was any other one
-    converged, _, _ = solve_near(
-        rig, work, call.limits, y, call.signals[0], AT_ONCE, call.powers, call.wrenches
-    )
-    put(work.k, out)
-    for i in range(rig.source_pushed.size):
-        work.load[rig.source_pushed[i]] += effort(rig, work, i, AT_ONCE)
-    for i in range(rig.body_coordinate.size):
-        load = work.load[rig.body_coordinate[i]]
-        out[rig.body_V_start + i] = load / rig.p[rig.body_mass_at[i]]  # (17), (18)
-        out[rig.body_q_start + i] = y[rig.body_V_start + i]
-    call.converged[0] = 1 if converged else 0

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled, contacts, pads
+from torchsoft.solve.kernel.arrays import SIDE
 from torchsoft.solve.kernel.linear import put, solve_dense
 from torchsoft.solve.kernel.sources import drive, keep_states, resist
 from torchsoft.solve.kernel.table import Array
@@ -45,13 +46,14 @@ def scan(rig: Any, work: Any, y: Array, margin: float) -> None:
         at = rig.pad_point_start[pad]
         count, low, high = 0, last, first
         for k in range(at, rig.pad_point_start[pad + 1]):
-            n0, n1 = rig.point_node[k, 0], rig.point_node[k, 1]
             ux, uy = contacts.at_point(rig, k, work.u)
             contacts.place(rig, work, k, ux, uy, 0.0, 0.0, work.probe)
             if not contacts.separation(rig, work, k, work.probe) > margin:
                 work.window[at + count] = k
                 count += 1
-                low, high = min(low, min(n0, n1)), max(high, max(n0, n1) + 1)
+                for j in range(SIDE):
+                    node = rig.point_node[k, j]
+                    low, high = min(low, node), max(high, node + 1)
         for node in range(first, last):
             if node < work.low[pad] or node >= work.high[pad]:
                 work.u_dot[node, 0], work.u_dot[node, 1] = work.free[node, 0], work.free[node, 1]

@@ -9,7 +9,7 @@ derivatives of the state and of the parameters, or their cotangents.
 from typing import Any
 
 from torchsoft.solve.kernel import compiled, contacts
-from torchsoft.solve.kernel.arrays import AXES, PAIR, TINY, WRENCH
+from torchsoft.solve.kernel.arrays import AXES, PAIR, SIDE, TINY, WRENCH
 from torchsoft.solve.kernel.invoke import call_pull, call_push
 from torchsoft.solve.kernel.linear import add, bounds, carry, dot
 from torchsoft.solve.kernel.nodal import inertial
@@ -136,7 +136,7 @@ def carry_to_point(
 ) -> None:
     """A quantity of nodes (., 2, columns), by their slots or themselves, and of coordinates as that
     of point k (columns, 8)."""
-    for j in range(rig.point_node.shape[1]):
+    for j in range(SIDE):
         node, N = rig.point_node[k, j], rig.point_N[k, j]
         for o in range(AXES if N != 0.0 else 0):
             carry_entry(N, nodes[work.slot[node] if slots else node, o], out, o, back)
@@ -170,7 +170,7 @@ def carry_through(
 def carry_force(rig: Any, work: Any, along: Any, k: int, X: Array, out: Array, back: bool) -> None:
     """The force of point k to its nodes, X, and its wrench to the equations of bodies, along.r."""
     c, columns = rig.point_contact[k], out.shape[1]
-    for j in range(rig.point_node.shape[1]):
+    for j in range(SIDE):
         N, slot = rig.point_N[k, j], AXES * work.slot[rig.point_node[k, j]]
         for o in range(AXES if N != 0.0 else 0):
             carry(N, out[o], X[slot + o, :columns], back)
