@@ -75,7 +75,7 @@ def differences(way: Way, h: float) -> Found:
 
 def slid(
     case: Case, mu: float = MU, v: float = V, at: float = 5.0, tau: float = TAU, elements: int = 8,
-    h: float = 0.0, **steps: float,
+    h: float = 0.0, **steps: Any,
 ) -> Found:  # fmt: skip
     """torchsoft's run from `at` heights of the pad, with forward sensitivities or differences."""
     if h:
@@ -90,6 +90,7 @@ def slid(
         rig, grid(case.duration), y0=y0, gradient="forward", wrt=mus, dy0=dy0, rigid=True, **steps
     )
     x = rig.layout.rigid.index(rig.layout.slices["pose", "body"].start)
+    assert run.sensitivities is not None
     by_mu_s, by_mu_k, by_v = run.sensitivities[-1, x].tolist()
     return float(run["x_body"][-1] - run["x_body"][0]), by_mu_s + by_mu_k, by_v
 
@@ -154,7 +155,8 @@ def mjx(case: Case, cone: str, contact: str = "", dt: float = 2e-3) -> Found:
     directions = directions[0], directions[1].at[1, 0].set(1.0), directions[2]
     for _ in range(round(case.duration / dt)):
         state, directions = advance(state, directions)
-    return float(state[0][0] - data.qpos[0]), *map(float, directions[0][:, 0])
+    by_mu, by_v = directions[0][:, 0]
+    return float(state[0][0] - data.qpos[0]), float(by_mu), float(by_v)
 
 
 def newton(case: Case, dt: float, ke: float, kd: float, kf: float) -> Found:
