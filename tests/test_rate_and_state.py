@@ -175,8 +175,9 @@ def rates_of(k: float) -> complex:
     return max(np.linalg.eigvals(J), key=lambda rate: rate.imag)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("ratio", [1.1, 1.3, 1.5])
+@pytest.mark.parametrize(
+    "ratio", [1.3, *(pytest.param(ratio, marks=pytest.mark.slow) for ratio in (1.1, 1.5))]
+)
 def test_a_spring_slider_is_as_stable_as_linear_theory_has_it(ratio):
     """Over ten nodes, whose points begin with an old age; k_c is that of the mass too,
     1.17 (b - a) F_N / D_c. A thousandth of the age is the disturbance, in a run along the same
