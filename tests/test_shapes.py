@@ -284,6 +284,10 @@ def test_a_contour_is_read_from_a_file_whose_columns_have_names_and_units(tmp_pa
         ("", "is empty"),
         ("x [mm],y [mm],z [mm]\n1,2,3\n", "column `z` is not known"),
         ("x [mm],y [mm]\n1,2\n", r"pear.csv: `points` must be at least 8 places"),
+        (
+            "x [m],y [m]\n-15,0\n15,0\n",
+            "the outline is 30 m wide; is the unit in the heading right",
+        ),
     ):
         file.write_text(text, encoding="utf-8")
         with pytest.raises(ValueError, match=match):
@@ -307,7 +311,7 @@ def test_a_centre_of_mass_off_the_given_origin_is_logged(caplog):
     RoundedPolygon(box(20e-3, 9e-3), 2e-3)
     assert caplog.text == ""
     RoundedPolygon(np.array(box(20e-3, 9e-3)) + [0.5, 0.25], 2e-3)
-    assert "the centre of mass is at (0.5, 0.25) m of `vertices`" in caplog.text
+    assert "the centre of mass is at (500.000, 250.000) mm" in caplog.text
 
 
 def test_a_body_held_upright_although_its_pad_would_turn_it_is_warned_about():
