@@ -112,8 +112,8 @@ def plan(
 
     `over` holds draws of uncertain parameters by name (draws, ...), y0 their starts (draws, size)
     if these differ, the first draw being the nominal one. The mean error of every target is brought
-    to zero, and the spread of errors lowered with the objective's mean. Limits are kept in every
-    draw.
+    to zero, or within a quarter of the tolerance where there are more targets than free values, and
+    the spread of errors lowered with the objective's mean. Limits are kept in every draw.
 
     "slsqp" takes up to `iterations` steps of sequential quadratic programming; "adam" as many
     steps of Adam at `rate`, projected onto the bounds, with squared errors and excess as a price:
