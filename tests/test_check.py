@@ -219,7 +219,7 @@ REPORTED = {
     "a gap": (csv("t [s],x_d [mm]\n0,0\n1,\n"), r"row 3, column `x_d` is empty"),
     "backwards": (csv("t [s],x_d [mm]\n1,0\n0,1\n"), r"row 3, .* 0 s follows 1 s; times must incr"),
     "a clock": (csv("t [s],x_d [mm]\n1.7e9,0\n1.7000001e9,1\n"),
-        r"begins at 1\.7e\+09 s, and the run ends at 2 s: .* say from_first = true"),
+        r"begins at 1\.7e\+09 s, and the run ends at 2 s: .* set from_first = true"),
     "an encoder, strain": (
         csv(f"t [s],x_d [mm]\n{STEPS}") | {"motion.y_d.values": ("start", 44e-3)},
         r"warning: motion\.x_d\.file: .*in steps of 0\.0001 m, as of an encoder: .*0\.01 m/s",

@@ -103,7 +103,7 @@ ERRORS = [
     ("identify rig.toml", "there is nothing to identify from"),
     ("identify picture.csv rig.toml", "picture.csv is not a table of text in UTF-8, UTF-16 or"),
     ("identify empty.csv rig.toml", "empty.csv is empty"),
-    ("identify data.csv many.toml", "fewer starts or less data, or say --yes to begin"),
+    ("identify data.csv many.toml", "fewer starts or less data, or use --yes to begin"),
     ("identify data.csv rig.toml --out data.csv", "--out: results cannot be written to data.csv"),
     ("identify data.csv rig.toml --checkpoint mine", "mine holds other files; give a new"),
     ("material fit test.csv --area 1e-5", "`stress` needs no `area`"),
@@ -149,6 +149,16 @@ def test_neither_locale_nor_window_system_matters(tmp_path):
     )  # fmt: skip
     assert ended.returncode == 2
     assert re.fullmatch(rb"torchsoft: error: \\u\w+\\u\w+\.toml: No such.*\n", ended.stderr)
+
+
+def test_a_fitted_material_has_the_assumed_numbers_that_the_test_does_not_tell(folder):
+    assert main(["material", "fit", "test.csv", "--rho", "1200"]) == 0
+    text = Path("out/material/material.toml").read_text()
+    (table,) = tomllib.loads(text)["materials"].values()
+    assert [re.search(f"{name} = .*: (.*)", text)[1] for name in ("rho", "nu")] == [
+        "stated", "assumed"
+    ]  # fmt: skip
+    assert (table["depth"], table["nu"], table["rho"]) == (44e-3, 0.45, 1200.0)
 
 
 # identification
@@ -237,7 +247,7 @@ def test_a_recording_that_looks_wrong_is_rejected_with_the_way_on(folder, capsys
     assert identify() == 2
     message = capsys.readouterr().err
     assert "Recording `data`: the sign of effort_y looks opposite." in message
-    assert message.endswith('If it is right, say acknowledged = ["sign of effort_y"]\n')
+    assert message.endswith('If it is right, set acknowledged = ["sign of effort_y"]\n')
     assert not (folder / "out" / "answer.json").exists()
 
 

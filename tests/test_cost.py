@@ -25,7 +25,7 @@ def test_hours_and_memory_need_the_users_word(price):
     with mock.patch("sys.stdin") as keys, mock.patch("sys.stderr") as screen:
         keys.isatty.return_value = False
         with pytest.raises(
-            Costly, match=r"^this takes about .* GiB of memory; take less, or say --yes to begin$"
+            Costly, match=r"^this takes about .* GiB of memory; take less, or use --yes to begin$"
         ):
             agree(price, False, "take less")
         keys.isatty.return_value = screen.isatty.return_value = True
@@ -74,7 +74,7 @@ def test_a_run_that_takes_long_asks_first(tmp_path, monkeypatch, capsys):
     assert main(["run", "rig.toml", "--out", "out"]) == 2
     error = capsys.readouterr().err
     assert re.search(r"this takes about .* \(2e\+08 steps\)", error), error
-    assert "or say --yes to begin" in error
+    assert "or use --yes to begin" in error
     assert not Path("out").exists()
 
 
@@ -86,4 +86,4 @@ def test_a_rig_that_needs_the_machines_memory_asks_first(command, tmp_path, monk
     )
     with mock.patch("torchsoft.cost.machine_memory", return_value=1.0):
         assert main([command[0], "rig.toml", *command[1:]]) == 2
-    assert re.search(r"GiB of memory; .*or say --yes to begin", capsys.readouterr().err)
+    assert re.search(r"GiB of memory; .*or use --yes to begin", capsys.readouterr().err)

@@ -111,6 +111,9 @@ def test_other_headings_and_columns_to_ignore(tmp_path):
         with pytest.raises(ValueError, match=message):
             read(path, headings=headings | wrong)
     assert read(path, headings={"Zeit": "t"}, ignore=None).ignored == ("Kraft", "Temp", "Weg")
+    path.write_text("Zeit [s],Kraft [N]\n0,n/a\n")
+    with pytest.raises(ValueError, match="row 2, column `Kraft`: 'n/a' is not a finite number"):
+        read(path, headings={"Zeit": "t", "Kraft": "force"})
 
 
 def test_forces_of_scales_are_weights():

@@ -160,7 +160,7 @@ def test_normal_and_chosen_values_have_their_distributions():
 @pytest.mark.parametrize(
     ("file", "out", "message"),
     [
-        ("large.toml", "set", "or say --yes to begin"),
+        ("large.toml", "set", "or use --yes to begin"),
         ("none.toml", "set", "No such file"),
         ("set.toml", "nowhere://set", "Protocol not known: nowhere"),
     ],

@@ -251,7 +251,7 @@ REJECTED = [
     ({"duration": 0.25}, "must be a multiple of `interval` = 0.1 s, but is 0.25 s"),
     ({"begin": 2.25}, "but is 0.05 s, the rest of the run after `begin`"),
     ({"begin": 9.0, "duration": 0.5}, "9 s is not before the end of the rig's own motion"),
-    ({"reward": lambda *_: 0.0}, "give either a `goal` or a `reward`"),
+    ({"reward": lambda *_: 0.0}, "give either `goal` or `reward`: each defines"),
     ({"goal": TargetPose("disk", {"x": 0.0}, {"x": 1.0})}, "`goal.target` names `disk.x`; did"),
     ({"goal": TargetPose("disc", {"x": 0.0}, {"y": 1.0})}, "must have the coordinates of"),
     ({"bounds": {"lower.y": (0, 1)}}, "`lower.y`; did you mean `lower.x`? (free are disc.x"),

@@ -151,7 +151,7 @@ def test_a_folder_of_other_files_is_not_written_to(tmp_path):
     other.mkdir()
     (other / "summary.json").write_text("mine")
     with pytest.raises(
-        ValueError, match=r"--out: .*other holds summary\.json, which is no result .* say --force"
+        ValueError, match=r"--out: .*other holds summary\.json, which is no result .* use --force"
     ):
         claim(other)
     claim(other, force=True)

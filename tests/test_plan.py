@@ -185,6 +185,37 @@ def test_an_unreachable_target_has_reasons():
     assert "NOT reached" in repr(found)
 
 
+def test_more_targets_than_free_values_are_reached_where_they_can_be():
+    free = {"right_y": FREE["right_y"]}
+    still = Target(channel="omega_object", value=0.0, tolerance=1.0)
+    near = TURN.model_copy(update={"value": math.radians(5)})
+    assert planned(free, targets={"turn": near, "still": still}).reached
+    found = planned(free, targets={"turn": TURN, "still": still}, seconds=1e-9)
+    assert any("more targets (2) than values (1): add knots" in one for one in found.reasons)
+
+
+def test_slip_before_anything_may_move_is_no_reason():
+    """At touch-down every point slips for a moment."""
+    few = {"elements_x": 20, "elements_y": 2, "points": 1}
+    file = template("press").override(
+        pads={"lower": few, "upper": few}, outputs={"duration": 0.3},
+        bodies={"disc": {"start": {"x": 1e-3}}, "bracket": {"start": {"y": "touch"}}},
+        motion={
+            "x_d": {"kind": "hold"},
+            "y_d": {"times": [0.0, 0.02, 0.1, 0.2], "values": ["start"] * 4},
+            "press": {"times": [0.0, 0.1], "values": [0.0, -20.0]},
+        },
+    )  # fmt: skip
+    built = file.build()
+    for after, slips in ((0.02, True), (0.1, False)):
+        found = plan(
+            built.rig, built.t, {"y_d": Bounds(low=40e-3, high=60e-3, speed=0.1, after=after)},
+            targets={"down": Target(channel="y_bracket", value=45e-3, tolerance=1e-6)},
+            y0=built.y0, seconds=1e-9,
+        )  # fmt: skip
+        assert any("`upper` slips" in one for one in found.reasons) == slips
+
+
 @pytest.mark.parametrize("case", ["finer", "one, then Ctrl-C"])
 def test_runs_that_fail_are_worse_and_an_interrupt_keeps_the_best(monkeypatch, case):
     """A plan whose finer run fails is not reached."""

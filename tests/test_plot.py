@@ -162,7 +162,7 @@ def test_text_of_a_saved_page_is_text_in_a_font_that_journals_take(done, tmp_pat
 def test_panels_show_what_their_axes_name(done, held):
     """The friction over the largest that the cone allows [%], and moments [N mm]."""
     run, mu = done[1], done[0].parameter("contact.mu_s").item()
-    lines = dashboard(run, only=["friction in its cone"]).axes[0].lines
+    lines = dashboard(run, only=["share of the friction limit"]).axes[0].lines
     for force, line in zip(run.force.values(), lines):
         share = 100 * force[..., 1].abs().sum(-1) / (mu * force[..., 0].sum(-1))
         np.testing.assert_allclose(line.get_ydata()[5:], share[5:], rtol=1e-9)

@@ -161,7 +161,7 @@ PARTS = [
     (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None), "`friction` must be a function or a"),
     (lambda: ran(friction=rated(lambda N: N.mean().expand_as(N))),
      r"aten\.mean\.default, which couples contact points at .*test_"),
-    (lambda: ran(friction=rated(lambda N: N / N.numel())), "several points at once other .*numel"),
+    (lambda: ran(friction=rated(lambda N: N / N.numel())), "points together .*numel"),
     (lambda: resting(friction=rated(lambda N: torch.eye(4, 2).double() @ N)),
      "of `L` must take three tensors .*RuntimeError"),
     (lambda: controller(FEEDBACK, **ONE | {"pushes": {"x": "disc.x", "y": "disc.y"}}),
@@ -198,7 +198,7 @@ def test_a_coupled_law_is_rejected_after_its_pointwise_twin():
     """For one point both have the same expression, which is compiled already."""
     model = still(COARSE, friction=rated(lambda N: N, mu=0.49))
     simulate(model, T, y0=rest(model).detach())
-    with pytest.raises(ValueError, match="several points at once other rates"):
+    with pytest.raises(ValueError, match="other rates for several points together"):
         ran(friction=rated(lambda N: N.sum().expand_as(N), mu=0.49))
 
 

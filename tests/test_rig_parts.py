@@ -280,6 +280,8 @@ def test_a_law_of_a_python_file_is_run_where_the_user_says_so(tmp_path, monkeypa
     given = RigFile.ready("drop").override({"outputs.duration": 0.1, "outputs.snapshots": []})
     expected = given.build({"laws.dry.friction": file.build().rig.contacts["ground"].law.friction})
     assert torch.equal(found["theta_ellipse"], expected.run(rtol=1e-3)["theta_ellipse"])
+    with pytest.raises(ValueError, match=r"laws\.dry\.friction: must be one part, but is a dict"):
+        given.build({"laws.dry.friction": {"dry": expected}})
     with pytest.raises(ValueError, match=r"laws.dry.friction.law: .*no function"):
         of_a_file(tmp_path, "none").build()
     (tmp_path / "law.py").unlink()

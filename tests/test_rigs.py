@@ -294,7 +294,7 @@ def test_what_is_wrong_is_not_run_unless_it_is_meant(small, tmp_path, capsys):
     assert main(["check", str(path)]) == 2
     assert "error: bodies.disc: it and bodies.stone overlap" in capsys.readouterr().out
     assert ran(path, out) == 2
-    assert "wrong.toml is not run; fix what is wrong, or say --anyway" in capsys.readouterr().err
+    assert "wrong.toml is not run; fix what is wrong, or use --anyway" in capsys.readouterr().err
     assert not out.exists()
     assert ran(path, out, "--anyway") == 0
     assert "bodies.stone overlap" in capsys.readouterr().err

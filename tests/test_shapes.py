@@ -274,6 +274,10 @@ def test_a_contour_is_read_from_a_file_whose_columns_have_names_and_units(tmp_pa
         ("", "is empty"),
         ("x [mm],y [mm],z [mm]\n1,2,3\n", "column `z` is not known"),
         ("x [mm],y [mm]\n1,2\n", r"pear.csv: `points` must be at least 8 places"),
+        (
+            "x [m],y [m]\n-15,0\n15,0\n",
+            "the outline is 30 m wide; is the unit in the heading right",
+        ),
     ):
         file.write_text(text, encoding="utf-8")
         with pytest.raises(ValueError, match=match):

@@ -111,7 +111,7 @@ REJECTED_DATA = [
     (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
     (put(1, X_C, "v_x [um/s]"), r"rig\.toml: sensors: no recording has samples of `x_C`"),
     # cells
-    (lambda table: table[6].append("1"), r"row 7 has 13 cells, but there are 12 columns"),
+    (lambda table: table[6].append("1"), r"row 7 has 13 cells, but there are 12 columns; complete"),
     (put(9, X_C, "n/a"), r"row 9, column `x_C`: 'n/a' is not a finite number; leave the cell empt"),
     (put(12, Y_D, " "), r"row 12, column `y_d` is empty; only measured channels may have gaps"),
     (both(*(put(row, X_C, "") for row in range(3, 63))), r"`x_C` has 1 samples, but needs at"),
@@ -165,7 +165,7 @@ REJECTED_CONFIG = [
     (CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n', r"a `file` or `files`, not"),
     (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, .* data, data"),
     (CONFIG + '[[recordings]]\nname = "data"\nsettings."pad.E" = 2e6\n',
-        r"recordings\.0\.settings: .*is unknown, .* say by unknowns\..*nominal where"),
+        r"recordings\.0\.settings: .*is unknown, .* set by unknowns\..*nominal where"),
     # laws to compare
     (CONFIG + 'loss = "huber"\n' + COULOMB, r"fit\.loss must be 'linear', not 'huber'"),
     (CONFIG + f'[compare.coulomb]\nwithout = ["{LAW}.R_t"]\n', r"without: `.*R_t` is not an"),
@@ -230,7 +230,7 @@ def test_a_trajectory_file_is_a_recording(run, tmp_path):
     [
         (lambda data: xr.Dataset({"time": ("time", [0.0, 1.0])}), "it has no time and channels"),
         (lambda data: data.assign(theta_C=data.theta_C.where(data.time != data.time[7])),
-         r", sample 7, `theta_C` is not a finite number"),
+         r", sample 7, column `theta_C` is not a finite number"),
         (lambda data: data.assign(theta_C=data.theta_C.assign_attrs(units="deg")),
          r", `theta_C` should be in rad, not 'deg'"),
         (lambda data: data.assign(x_d=("time", ["here"] * 31)), r"`x_d` should be float64"),

@@ -313,7 +313,7 @@ def test_findings_of_a_kind_are_reported_once_and_reject_unless_acknowledged():
     assert [f.facts["name"] for f in found] == ["sign of F_x", "size of F_x"]
     assert str(found[0]).endswith("The same holds for recording `b`.")
     for some, given, says in (
-        (found, [], r'say acknowledged = \["sign of F_x"\]'),
+        (found, [], r'set acknowledged = \["sign of F_x"\]'),
         (found, ["sign of F_x", "nonsense"], "'nonsense'.* the findings are sign of F_x, size of"),
         ([], ["nonsense"], "acknowledged: .*'nonsense', .* nothing looks wrong"),
     ):

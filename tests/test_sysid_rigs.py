@@ -146,7 +146,8 @@ def test_an_angle_that_wraps_is_named_and_unwrapped(folder, heading, low):
         (folder / "fit.toml").write_text(fit, encoding="utf-8")
 
     stated("unwrap = false")
-    words = rf"row {jump + 2}, column `{heading}` jumps by a turn, .* columns.{heading}.unwrap = "
+    shown = of and r" \(theta_disc\)"
+    words = rf"row {jump + 2}, column `{heading}`{shown} jumps by a turn, .*{heading}.unwrap = "
     with pytest.raises(ValueError, match=words):
         loaded(folder)
     stated("unwrap = true")

@@ -129,7 +129,7 @@ def test_bounds_hold_in_every_recording(others):
 @pytest.mark.parametrize(("others", "name"), [(({"E": 1e6},), "two"), (({}, {"E": 1e6}), "three")])
 def test_a_search_starts_where_all_rigs_are_or_where_nominal_states(others, name):
     with pytest.raises(
-        ValueError, match=rf"`one` and 1e\+06 in that of `{name}`: say by `nominal`"
+        ValueError, match=rf"`one` and 1e\+06 in that of `{name}`: set by `nominal`"
     ):
         coordinates(*others, E={})
     assert len(coordinates(*others, E={"nominal": 1e6})) == 1

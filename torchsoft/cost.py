@@ -74,7 +74,7 @@ def agree(cost: Cost, yes: bool, help: str) -> None:
         print(f"{cost.sentence}; begin? [y/N] ", end="", file=sys.stderr, flush=True)
         if sys.stdin.readline().strip().lower() in ("y", "yes"):
             return
-    raise Costly(f"{cost.sentence}; {help}, or say --yes to begin")
+    raise Costly(f"{cost.sentence}; {help}, or use --yes to begin")
 
 
 def rig_step(rig: Rig, differentiated: int = 0) -> float:

@@ -75,10 +75,11 @@ Rows = list[tuple[int, list[str]]]
 
 
 class Column(NamedTuple):
-    """A known column: its name, its unit, and the size in SI units of that unit and of one percent,
-    NaN where the column has a dimension."""
+    """A known column: its name and its heading in the file, its unit, and the size in SI units of
+    that unit and of one percent, NaN where the column has a dimension."""
 
     name: str
+    written: str
     unit: str
     size: float
     percent: float
@@ -186,7 +187,8 @@ def body(
     for row, cells in rows:
         if len(cells) != len(columns):
             raise ValueError(
-                f"{path}, row {row} has {len(cells)} cells, but there are {len(columns)} columns"
+                f"{path}, row {row} has {len(cells)} cells, but there are {len(columns)} columns; "
+                "complete the row, or delete it"
             )
         used = [(one, cell) for one, cell in zip(columns, cells) if one]
         values.append([number(path, row, one, cell, comma) for one, cell in used])
@@ -387,7 +389,7 @@ def heading(
         if name in (one.name for one in out if one):
             raise ValueError(f"{where} is there twice")
         percent = 0.01 * known[name].get("1", math.nan)
-        out.append(Column(name, unit, known[name][unit], percent))
+        out.append(Column(name, written, unit, known[name][unit], percent))
     return out
 
 
@@ -415,7 +417,7 @@ def number(path: Path, row: int, column: Column, cell: str, comma: bool = False)
         value = math.nan
     if not math.isfinite(value):
         raise ValueError(
-            f"{path}, row {row}, column `{column.name}`: {shown(text)} is not a finite number; "
+            f"{path}, row {row}, column `{column.written}`: {shown(text)} is not a finite number; "
             "leave the cell empty where a sample is missing, and write plain numbers in "
             f"{column.unit} elsewhere"
         )

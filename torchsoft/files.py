@@ -125,7 +125,7 @@ def claim(folder: Path, force: bool = False) -> None:
     if not force and not is_results(folder) and (there := sorted(folder.iterdir())):
         raise ValueError(
             f"--out: {folder} holds {there[0].name}, which is no result of torchsoft and might be "
-            "overwritten; name a new folder, or say --force"
+            "overwritten; name a new folder, or use --force"
         )
 
 

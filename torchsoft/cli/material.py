@@ -163,7 +163,7 @@ def tested(options: argparse.Namespace, nu: float) -> "Fit | PullFit":
         return energy(options, test, given)
     for name in ("also", "relaxation", "fast"):
         if getattr(options, name):
-            raise ValueError(f"--{name} is of energies: say which, --energy yeoh")
+            raise ValueError(f"--{name} is of energies: state which, such as --energy yeoh")
     if not isinstance(test, Pull):
         return fit(test, terms=options.terms)
     if options.terms is not None:
@@ -179,7 +179,7 @@ def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "Pu
 
     if not isinstance(test, Pull):
         raise ValueError(
-            f"{options.file}: an energy is of a pull, a compression or a shear; say --test tension"
+            f"{options.file}: an energy is of a pull, a compression or a shear; use --test tension"
         )
     pulls = [test]
     for name, file in (one.partition("=")[::2] for one in options.also):
@@ -191,7 +191,7 @@ def energy(options: argparse.Namespace, test: Any, given: dict[str, Any]) -> "Pu
     found = fit_energy(pulls, options.energy, nu=given["nu"], terms=options.terms)
     if options.relaxation is None:
         if options.fast:
-            raise ValueError("--fast is against a relaxation test: say which, --relaxation FILE")
+            raise ValueError("--fast is against a relaxation test: state it, --relaxation FILE")
         return found
     given |= {"whole": False, "true": False, "strains": None}
     over_time = read(options.relaxation, test="relaxation", **given)

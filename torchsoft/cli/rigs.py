@@ -69,7 +69,7 @@ def run_rig(options: argparse.Namespace) -> int:
     for one in found:
         say(one, error=True)
     if any(one.severity == "error" for one in found) and not options.anyway:
-        return failed(f"{options.file} is not run; fix what is wrong, or say --anyway")
+        return failed(f"{options.file} is not run; fix what is wrong, or use --anyway")
     try_folder(out, options.force)
     done = run(file, out, found=found, progress=options.progress)
     if isinstance(done.stopped, SimulationFailed):

@@ -265,7 +265,7 @@ POINTS = 3
 """Points that are traced side by side."""
 
 REMEDY = (
-    "a law is of one point, so leave the points' own dimension alone: mean(-1) of a stack of a "
+    "a law describes one point, so leave the points' own dimension alone: mean(-1) of a stack of a "
     "point's numbers is fine"
 )
 

@@ -112,7 +112,7 @@ class Dynamics:
         if not 0 <= self.start < float("inf"):
             raise ValueError(f"`begin` must be a time from 0 s on, but is {begin} s")
         if (goal is None) == (reward is None):
-            raise ValueError("give either a `goal` or a `reward`, which each make the reward")
+            raise ValueError("give either `goal` or `reward`: each defines the reward")
         rig = self.rig
         if not actions:
             raise ValueError(f"`actions` is empty; name signals of {', '.join(rig.signals)}")

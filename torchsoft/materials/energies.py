@@ -64,7 +64,7 @@ class PullFit:
     @property
     def described(self) -> str:
         """What was fitted, and how well."""
-        return f"{self.kind}, residual {self.rms:.2%} of the largest"
+        return f"{self.kind}, residual {self.rms:.2%} of the largest stress"
 
     def method(self) -> dict[str, Any]:
         """How the coefficients were found, and how well they fit, for a summary in JSON."""
@@ -300,6 +300,6 @@ def notices(
     if extreme:
         yield f"at the limit of exponents, {limit:g}: {', '.join(extreme)}; take fewer terms"
     yield (
-        "the specimen counts as incompressible and at the speed of the test: what the rubber does "
-        "over time is of a relaxation, a creep or a frequency test"
+        "the specimen is taken as incompressible; the modulus belongs to the speed of this test. "
+        "For the time dependence, fit a relaxation, creep or frequency test."
     )

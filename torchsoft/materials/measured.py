@@ -242,7 +242,7 @@ def read(
     if "t" not in values:
         raise ValueError(
             f"{path} has no column `t`: over time it would be a relaxation or a creep test; for a "
-            "modulus say test = tension or compression, and the range of strains"
+            "modulus set test = tension or compression, and the range of strains"
         )
     if strains is not None:
         raise ValueError(f"{path}: a range of strains is of a tension or a compression test")
@@ -316,7 +316,7 @@ def held(path: Path, strain: Array, stress: Array) -> Literal["relaxation", "cre
     if min(change) > HELD:
         raise ValueError(
             f"{path}: neither strain nor stress was held, they change by {change[0]:.0%} and "
-            f"{change[1]:.0%} over the second half; say test = relaxation where the strain was "
+            f"{change[1]:.0%} over the second half; set test = relaxation where the strain was "
             "controlled, creep where the stress was, tension or compression for a modulus"
         )
     return "relaxation" if change[0] <= change[1] else "creep"
@@ -387,8 +387,8 @@ def pulled(
         strains = float(up.min()), float(up[-1])
     if strains is None:
         raise ValueError(
-            f"{path}: a modulus is of a range of strains, which must be given; strains go from "
-            f"{up[0]:.3g} to {up[-1]:.3g}"
+            f"{path}: state the strains between which the modulus is fitted: --range 0 0.1; the "
+            f"test goes from {up[0]:.3g} to {up[-1]:.3g}"
         )
     low, high = strains
     back = np.maximum.accumulate(up) - up
@@ -421,9 +421,7 @@ def pulled(
         (numbers[largest + 1 :], "after the largest strain"),
     )
     notices = tuple(
-        f"left out are {len(some)} rows from row {some[0]} to row {some[-1]}: {why}"
-        for some, why in left_out
-        if len(some)
+        f"rows {some[0]} to {some[-1]} were left out ({why})" for some, why in left_out if len(some)
     )
     return Pull(path, test, x, y, (low, high), notices)
 

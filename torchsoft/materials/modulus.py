@@ -14,7 +14,7 @@ def modulus(pull: Pull) -> PullFit:
     offset. Raises `ValueError` where the stress does not grow with strain."""
     if pull.test not in ("tension", "compression"):
         raise ValueError(
-            f"{pull.path}: the modulus of a {pull.test} test is not E; say --energy neo_hookean"
+            f"{pull.path}: the modulus of a {pull.test} test is not E; use --energy neo_hookean"
         )
     x, y = pull.strain, pull.stress
     (E, offset), spread = np.polyfit(x, y, 1, cov="unscaled")
@@ -32,15 +32,15 @@ def modulus(pull: Pull) -> PullFit:
 def notices(pull: Pull, E: float) -> list[str]:
     """Sentences on assumptions."""
     sentences = [
-        "a modulus at the speed of this test: a slower one gives less, a faster one more; what the "
-        "rubber does over time is of a relaxation, a creep or a frequency test"
+        "a modulus at the speed of this test: a slower one gives less, a faster one more. For "
+        "the time dependence, fit a relaxation, creep or frequency test"
     ]
     parabola = np.polyder(np.polyfit(pull.strain, pull.stress, 2))
     first, last = np.polyval(parabola, pull.strain[[0, -1]]).tolist()
     if abs(last - first) > CURVED * E:
         sentences.append(
             f"the slope goes from {1e-6 * first:.3g} to {1e-6 * last:.3g} MPa between these "
-            "strains: E is their mean, and holds for no others"
+            "strains: E is the mean slope of this range only"
         )
     if pull.strains[1] > SMALL_STRAIN:
         sentences.append(

@@ -54,12 +54,12 @@ def write(
             f"{found.measured.path}: the {found.kind} material of this fit is not physical: "
             f"{error}; look at the units and the signs of the columns"
         ) from None
-    save_text(folder / "material.toml", toml(found, assumed))
+    save_text(folder / "material.toml", toml(found, assumed, options))
     write_json(folder / "summary.json", summary(found, assumed, options))
     save(drawn(found), folder / "fit.png")
 
 
-def toml(found: Found, assumed: Mapping[str, float]) -> str:
+def toml(found: Found, assumed: Mapping[str, float], options: Mapping[str, object]) -> str:
     """The material as a table with the names of the constructor's arguments, with its origin and
     its limits in comments."""
     path, table = found.measured.path, found.table()
@@ -78,8 +78,9 @@ def toml(found: Found, assumed: Mapping[str, float]) -> str:
         f'kind = "{found.kind}"',
         *(toml_row(k, x, f"[{UNITS[k]}]{notes.get(k, '')}") for k, x in table.items()),
         *(
-            toml_row(k, x, f"[{UNITS[k]}] not of this {found.test} test: assumed")
+            toml_row(k, x, f"[{UNITS[k]}] not of this {found.test} test: {origin}")
             for k, x in assumed.items()
+            for origin in ("assumed" if options.get(k) is None else "stated",)
         ),
     ]
     return "\n".join(rows) + "\n"

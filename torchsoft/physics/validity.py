@@ -292,9 +292,9 @@ def check_slip(where: str, law: Any, R: float) -> str:
         )
     if not torch.allclose(together, alone, rtol=ALIKE_POINTS, atol=0.0):
         raise ValueError(
-            f"the slip law of `{where}` gives several points at once other rates than each of them "
-            "alone; a law is of one point, so it must not use the number of points (numel, shape, "
-            "len) or mix them"
+            f"the slip law of `{where}` gives other rates for several points together than for "
+            "each alone; a law describes one point, so it must not use the number of points "
+            "(numel, shape, len) or mix them"
         )
     wrong = torch.nonzero((R * alone < 0) | (R * alone > E * (1 + 1e-9)))[:, 0]
     if len(wrong):

@@ -33,6 +33,9 @@ CHECK = 0.01
 POLISH = 0.1
 """Relative tolerance of a second search, over that of the first, where the check fails."""
 
+LOADED = 0.01
+"""Part of its largest normal force above which a contact carries load."""
+
 Method = Literal["slsqp", "adam"]
 
 
@@ -109,8 +112,8 @@ def plan(
 
     `over` holds draws of uncertain parameters by name (draws, ...), y0 their starts (draws, size)
     if these differ, the first draw being the nominal one. The mean error of every target is brought
-    to zero, and the spread of errors lowered with the objective's mean. Limits are kept in every
-    draw.
+    to zero, or within a quarter of the tolerance where there are more targets than free values, and
+    the spread of errors lowered with the objective's mean. Limits are kept in every draw.
 
     "slsqp" takes up to `iterations` steps of sequential quadratic programming; "adam" as many
     steps of Adam at `rate`, projected onto the bounds, with squared errors and excess as a price:
@@ -230,20 +233,29 @@ def misses(errors: Mapping[str, Tensor], excess: Mapping[str, Tensor]) -> list[s
 
 
 def obstacles(search: Search, run: Trajectory) -> list[str]:
-    """What holds the best plan of a search back: active bounds, slip, and a run that fails."""
+    """What holds the best plan of a search back: too few free values, active bounds, slip while it
+    may move, and a run that fails."""
+    variables, targets = search.evaluator.variables, search.found.errors.shape[1]
+    since = min((one.after for one in variables.moves.bounds.values()), default=0.0)
+    few = f"free: more targets ({targets}) than values ({variables.n}): add knots, or free a number"
     return [
-        *search.evaluator.variables.active(search.found.z),
-        *slips(run),
+        *([few] if variables.n < targets else []),
+        *variables.active(search.found.z),
+        *slips(run, since),
         *(f"further on a run fails: {reason}" for reason in search.failures[-1:]),
     ]
 
 
-def slips(run: Trajectory) -> list[str]:
-    """Sentences on contacts whose points all slip at some time."""
+def slips(run: Trajectory, since: float) -> list[str]:
+    """Sentences on contacts whose points all slip under load at some time from `since` [s] on."""
     out = []
     for name, state in run.contact_state.items():
-        touching = state > 0
-        gross = touching.any(-1) & ((state == SLIPPING) | ~touching).all(-1)
+        load = run.force[name][..., 0].sum(-1)
+        gross = (
+            (run.t >= since)
+            & (load > LOADED * load.max())
+            & ((state == SLIPPING) | (state == 0)).all(-1)
+        )
         if bool(gross.any()):
             first, last = run.t[gross][[0, -1]].tolist()
             out.append(

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from torchsoft.plan.knots import Array
 from torchsoft.plan.problem import Evaluation
-from torchsoft.plan.search import Search
+from torchsoft.plan.search import WITHIN, Search
 from torchsoft.solve.gradients import GradientFailed
 
 STAGES, SHORTER, SHORTEST = 30, 0.4, 0.01
@@ -114,7 +114,8 @@ class Stage:
         return self.share * self.criterion.spread_slope(self._step(x)) @ self._inverse
 
     def _constraints(self) -> list[dict[str, Any]]:
-        """Bounds of motions, targets and limits, in SciPy's form."""
+        """Bounds of motions, targets and limits, in SciPy's form. SLSQP accepts no more equations
+        than variables: more targets than that become bands, of half of what a search aims for."""
         variables, terms, by_x = self.variables, self.search.evaluator.terms, self._inverse
         aim, rows = 0.0 if self.aim is None else self.aim, -variables.A @ by_x
         out = list[dict[str, Any]]()
@@ -125,10 +126,13 @@ class Stage:
         if len(variables.b):
             add("ineq", lambda x: variables.b + rows @ x, lambda _: rows)
         if terms.targets:
+            kind, signs, band = "eq", np.ones((1, 1)), 0.0
+            if self.search.found.errors.shape[1] > variables.n:
+                kind, signs, band = "ineq", np.array([[1.0], [-1.0]]), 0.5 * WITHIN
             add(
-                "eq",
-                lambda x: self._step(x).errors.mean(0) - aim,
-                lambda x: self._step(x).slopes[1].mean(0) @ by_x,
+                kind,
+                lambda x: (band + signs * (self._step(x).errors.mean(0) - aim)).ravel(),
+                lambda x: np.kron(signs, self._step(x).slopes[1].mean(0) @ by_x),
             )
         if terms.limits:
             add(

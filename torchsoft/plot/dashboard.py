@@ -144,7 +144,7 @@ def sums(run: Trajectory) -> list[Chart]:
     slipping points; none without contacts."""
     laws = {name: contact.friction for name, contact in run.setup.contacts.items()}
     known = all("mu_s" in law for law in laws.values())
-    share_of = "friction in its cone" if known else "friction over normal force"
+    share_of = "share of the friction limit" if known else "friction over normal force"
     kinds = {"normal force": "N", FRICTION_SUM: "N", share_of: "%", TOUCHING: "1", SLIDING: "1"}
     out = [Chart(kind, kind, unit, {}) for kind, unit in kinds.items()]
     for name, force in run.force.items():
@@ -164,7 +164,7 @@ def points(axes: Axes, run: Trajectory, touching: Chart, slipping: Chart) -> Non
     for name, values, colour in touching.coloured():
         axes.step(t, values, where="mid", color=colour, label=name)
         axes.fill_between(t, 0, slipping.curves[name], step="mid", color=colour, alpha=0.45, lw=0)
-    axes.fill_between([], [], color=INK, alpha=0.45, lw=0, label="of these slip")
+    axes.fill_between([], [], color=INK, alpha=0.45, lw=0, label="slipping")
     axes.set_ylim(0, None)
     axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True))
     legend_above(axes)

@@ -195,7 +195,7 @@ def stress_bar(figure: Figure, axes: Any, largest: float) -> None:
     if largest > 0:
         colours = ScalarMappable(Normalize(0.0, largest), STRESS)
         bar = figure.colorbar(colours, ax=axes, shrink=0.6, pad=0.01, aspect=30)
-        bar.set_label("von Mises' stress [kPa], elastic part", fontsize=rcParams["legend.fontsize"])
+        bar.set_label("von Mises stress [kPa], elastic part", fontsize=rcParams["legend.fontsize"])
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
 
 

@@ -67,8 +67,8 @@ class Instant(NamedTuple):
     """One sample in drawn units: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm,
     rad], positions [mm], forces [N].
 
-    mesh: pad -> (mesh nodes, 2); stress: pad -> von Mises' (elements,) [kPa]; points: contact ->
-    (points, 2); force: contact -> (points, 2), normal force and friction on the pad, the latter
+    mesh: pad -> (mesh nodes, 2); stress: pad -> von Mises stress (elements,) [kPa]; points: contact
+    -> (points, 2); force: contact -> (points, 2), normal force and friction on the pad, the latter
     positive along `along_surface`; state: contact -> (points,).
     """
 

@@ -40,6 +40,11 @@ def assemble(file: RigTables, parts: Mapping[str, Any] | None = None) -> Rig:
         part = left.pop(name, None)
         if isinstance(part, nn.Module):
             check_numbers(part)
+        elif isinstance(part, dict):
+            raise ValueError(
+                "must be one part, but is a dict; `controller` returns a dict of actuators: pass "
+                "each by its name"
+            )
         return part
 
     def made(group: str, build: Callable[[str, Any], M]) -> dict[str, M]:

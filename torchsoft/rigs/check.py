@@ -131,7 +131,7 @@ def carried(ready: BuiltRig) -> Iterator[Diagnostic]:
         yield Diagnostic(
             "error", f"bodies.{name}",
             f"nothing carries it: {reason}, no actuator pushes {name}.y, and gravity pulls; it "
-            "would fall out of the picture. Put a pad with a contact under it, fix y, or say "
+            "would fall out of the picture. Put a pad with a contact under it, fix y, or set "
             "weighted = false",
         )  # fmt: skip
 

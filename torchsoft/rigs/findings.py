@@ -181,9 +181,9 @@ def springs(run: Run) -> Iterator[Diagnostic]:
         if in_springs[row] > SOFTENED * whole[row]:
             yield Diagnostic(
                 "note", f"contacts.{name}",
-                f"the springs of its law take {float(in_springs[row] / whole[row]):.0%} of the "
-                "give under load, so that contact is softer than the pad; raise K_n, or say "
-                'K_n = "auto"',
+                f"the contact springs account for {100 * float(in_springs[row] / whole[row]):.0f} "
+                "% of the deflection under load, so that contact is softer than the pad; raise "
+                'K_n, or set K_n = "auto"',
             )  # fmt: skip
 
 

@@ -392,7 +392,7 @@ class PadTable(PartTable):
                 raise ValueError(
                     'an inertial pad has one retardation time (kind = "kelvin_voigt"), but '
                     f"`{self.material}` has "
-                    f"{material.branches}; say inertial = false, or take such a material"
+                    f"{material.branches}; set inertial = false, or take such a material"
                 )
         return Pad(
             self.mesh(folder), material, base=self.base, origin=self.origin, angle=self.angle,

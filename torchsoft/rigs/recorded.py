@@ -38,7 +38,7 @@ def recorded(one: Sampled, end: float, unit: str) -> Iterator[tuple[Severity, st
         yield (
             "error",
             f"begins at {first:g} s, and the run ends at {end:g} s: where its times are of a "
-            "clock, say from_first = true",
+            "clock, set from_first = true",
         )
     elif last > LONGER * end:
         yield (

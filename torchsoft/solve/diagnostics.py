@@ -55,9 +55,10 @@ SMALL_STRAIN = 0.05
 def strained(strain: float, time: float) -> str:
     """Sentence on a strain [1] that is not small, at a time [s]."""
     return (
-        f"strains reach {strain:.0%} at t = {time:.3g} s, and linear pads hold to "
-        f"{SMALL_STRAIN:.0%} or so: rubber is stiffer beyond, by 20 to 40 % in a layer that is "
-        "pressed by a sixth of its height"
+        f"strains reach {strain:.0%} at t = {time:.3g} s, and linear pads are accurate up to "
+        f"strains of about {100 * SMALL_STRAIN:g} %; rubber is stiffer beyond (by 20 to 40 % in a "
+        "layer that is pressed by a sixth of its height); use an energy such as "
+        'kind = "neo_hookean"'
     )
 
 

@@ -66,17 +66,20 @@ GAP = 0.1
 @dataclass(frozen=True)
 class Columns:
     """A table in SI units: `values` (n,) by column, NaN where a sample is missing, the number of
-    every row in the file, and the names of columns that were left out."""
+    every row in the file, the columns that are `known`, and the names of those left out."""
 
     path: Path
     values: dict[str, Array]
     rows: Sequence[int]
+    known: Vocabulary
     row: str = "row"
     ignored: tuple[str, ...] = ()
 
-    def at(self, i: int) -> str:
-        """The row as messages name it."""
-        return f"{self.path}, {self.row} {self.rows[i]}"
+    def at(self, i: int, column: str) -> str:
+        """The row and the column as messages name them, the column by its heading."""
+        heading = self.known.heading(column)
+        channel = "" if heading == column else f" ({column})"
+        return f"{self.path}, {self.row} {self.rows[i]}, column `{heading}`{channel}"
 
     def near(self, time: float) -> str:
         """Names the first row at or after a time [s]."""
@@ -157,7 +160,7 @@ def check_times(tables: Tables) -> None:
             for i, over, where in ((0, t[0] - own[0], "begins"), (-1, own[-1] - t[-1], "ends")):
                 if over > np.diff(t).max():
                     raise ValueError(
-                        f"{table.at(i)}, column `t`: {own[i]:g} s is {over:.3g} s outside the "
+                        f"{table.at(i, 't')}: {own[i]:g} s is {over:.3g} s outside the "
                         f"times of `{name}`, which {where} at {t[i]:g} s ({known.path}): nothing "
                         "says what was asked for then"
                     )
@@ -176,11 +179,10 @@ def read_table(path: Path, ignore: Collection[str], known: Vocabulary) -> Column
             y[rows] = np.unwrap(y[rows])
         elif len(turns := wraps(y[rows])):
             i = int(turns[0])
-            heading = known.heading(name)
             raise ValueError(
-                f"{table.at(int(rows[i + 1]))}, column `{heading}` jumps by a turn, from "
-                f"{y[rows[i]]:.4g} to {y[rows[i + 1]]:.4g} rad, as an angle does that wraps: say "
-                f"columns.{heading}.unwrap = true"
+                f"{table.at(int(rows[i + 1]), name)} jumps by a turn, from "
+                f"{y[rows[i]]:.4g} to {y[rows[i + 1]]:.4g} rad, as an angle does that wraps: set "
+                f"columns.{known.heading(name)}.unwrap = true"
             )
     return table
 
@@ -203,7 +205,7 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
     near = nearest(re.sub(r"[^a-z]", "", name.lower()), plain)
     meant = f": did you mean `{plain[near]}`? If" if near else "; if"
     return (
-        f"{meant} it has nothing to do with the motion, say ignore = [{shown(name)}]; if it is one "
+        f"{meant} it has nothing to do with the motion, set ignore = [{shown(name)}]; if it is one "
         f"under another name, say which in [columns]; {known}"
     )
 
@@ -212,7 +214,7 @@ def read_csv(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
     """A table of numbers under `name [unit]`. Raises `ValueError` naming the row and the column."""
     units = {name: UNITS[unit] for name, unit in known.units.items()}
     table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore, known.headings)
-    return check_table(Columns(path, table.values, table.rows, ignored=table.ignored), known)
+    return check_table(Columns(path, table.values, table.rows, known, ignored=table.ignored))
 
 
 def read_trajectory(path: Path, ignore: Collection[str], known: Vocabulary) -> Columns:
@@ -221,11 +223,11 @@ def read_trajectory(path: Path, ignore: Collection[str], known: Vocabulary) -> C
     data = read_log(path) if path.suffix == ".mcap" else load(path)
     values = read_channels(data, path, known)
     left_out = tuple(name for name in ignore if values.pop(known.full(name), None) is not None)
-    table = Columns(path, values, list(range(len(values.get("t", ())))), "sample", left_out)
+    table = Columns(path, values, list(range(len(values.get("t", ())))), known, "sample", left_out)
     for name, column in values.items():
         if (bad := np.flatnonzero(~np.isfinite(column))).size:
-            raise ValueError(f"{table.at(bad[0])}, `{name}` is not a finite number")
-    return check_table(table, known)
+            raise ValueError(f"{table.at(bad[0], name)} is not a finite number")
+    return check_table(table)
 
 
 def read_channels(data: xr.Dataset, path: Path, known: Vocabulary) -> dict[str, Array]:
@@ -250,13 +252,13 @@ def read_channels(data: xr.Dataset, path: Path, known: Vocabulary) -> dict[str, 
     return {name: np.array(one.values, float) for name, one in values.items()}
 
 
-def check_table(table: Columns, known: Vocabulary) -> Columns:
+def check_table(table: Columns) -> Columns:
     """The table, where its times and set-points can be used. Raises `ValueError` naming row and
     column."""
     path, values = table.path, table.values
     if "t" not in values:
         raise ValueError(f"{path} has no column `t`")
-    setpoints = [name for name in known.asked if name in values]
+    setpoints = [name for name in table.known.asked if name in values]
     if len(table.rows) < (least := ROWS if setpoints else 2):
         raise ValueError(
             f"{path} has {len(table.rows)} rows of numbers, but needs at least {least}"
@@ -264,8 +266,7 @@ def check_table(table: Columns, known: Vocabulary) -> Columns:
     for name in ("t", *setpoints):
         if (empty := np.flatnonzero(np.isnan(values[name]))).size:
             raise ValueError(
-                f"{table.at(empty[0])}, column `{name}` is empty; only measured channels may have "
-                "gaps"
+                f"{table.at(empty[0], name)} is empty; only measured channels may have gaps"
             )
     t, most = values["t"], GAP if setpoints else np.inf
     apart = np.diff(t)
@@ -284,10 +285,10 @@ def check_table(table: Columns, known: Vocabulary) -> Columns:
                 f"time goes back, from {t[i]:g} to {t[i + 1]:g} s: sort the rows by time, or, if "
                 "the clock started again there, give what follows as a recording of its own"
             )
-        raise ValueError(f"{table.at(i + 1)}, column `t`: {fault}")
+        raise ValueError(f"{table.at(i + 1, 't')}: {fault}")
     for i in np.flatnonzero(apart < ROUNDED * np.abs(t).max())[:1]:
         raise ValueError(
-            f"{table.at(i + 1)}, column `t`: {t[i + 1]:.9g} s is too far from zero to be told from "
-            "the time before it; count times from the start"
+            f"{table.at(i + 1, 't')}: {t[i + 1]:.9g} s is too far from zero to be told from "
+            " the time before it; count times from the start"
         )
     return table

@@ -218,7 +218,7 @@ class Config(Table):
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "
-                    f'and say by unknowns."{strange[0]}".nominal where the search starts'
+                    f'and set by unknowns."{strange[0]}".nominal where the search starts'
                 )
 
 

@@ -71,7 +71,7 @@ EARLY, CREEP = 10e-3, 20e-3
 """Time [s] from the first sample during which coordinates may not exceed a speed [m/s] besides that
 of the file: a body put down on a pad still settles."""
 
-WAY_OUT = 'or say start = {kind = "moving"} for a recording that begins in motion or in mid-grasp'
+WAY_OUT = 'or set start = {kind = "moving"} for a recording that begins in motion or in mid-grasp'
 
 SLACK = 0.05
 """Time [s] by which a recording may start after the file's own motions, or end after them."""
@@ -132,8 +132,8 @@ def measured_samples(
             samples[channel] = (t[here], y[here])
         elif channel in sensors:
             raise ValueError(
-                f"{tables.of(channel).path}, column `{channel}` has {here.sum()} samples, but "
-                "needs at least two"
+                f"{tables.of(channel).path}, column `{tables.known.heading(channel)}` has "
+                f"{here.sum()} samples, but needs at least two"
             )
     if not set(samples) & set(sensors):
         files = ", ".join(str(table.path) for table in tables.tables)
@@ -181,7 +181,7 @@ def check_plausible(rig: Rig, state: State, tables: Tables) -> None:
         most = LARGEST.get(unit, FARTHEST * max(reach))
         for i in np.flatnonzero(np.abs(column) > most)[:1].tolist():
             raise ValueError(
-                f"{table.at(i)}, column `{name}`: {column[i]:.4g} {unit} is not plausible, it "
+                f"{table.at(i, name)}: {column[i]:.4g} {unit} is not plausible, it "
                 f"should be between {-most:.3g} and {most:.3g} {unit}"
                 + (f", {FARTHEST:g} times as far as the rig reaches" if unit == "m" else "")
                 + "; is the unit in the heading right?"
@@ -197,15 +197,15 @@ def check_clock(file: RigFile, rig: Rig, tables: Tables, start: StartTable) -> N
         t = table.values["t"]
         if t[-1] > end + SLACK:
             raise ValueError(
-                f"{table.at(-1)}, column `t`: {t[-1]:g} s is after the end of the file's own "
-                f"motions, {end:g} s, which `{own[0]}` follows; count times from their start, give "
-                "a column of it, or say in the settings how long they last, outputs.duration"
+                f"{table.at(-1, 't')}: {t[-1]:g} s is after the end of the file's own motions, "
+                f"{end:g} s, which `{own[0]}` follows; count times from their start, give a column "
+                "of it, or set in the settings how long they last, outputs.duration"
             )
         if not isinstance(start, Moving) and t[0] > SLACK:
             raise ValueError(
-                f"{table.at(0)}, column `t`: a recording that begins at rest begins with the "
-                f"file's own motions, at 0 s, not at {t[0]:g} s; count times from there, or say "
-                'start = {kind = "moving"}'
+                f"{table.at(0, 't')}: a recording that begins at rest begins with the file's "
+                f"own motions, at 0 s, not at {t[0]:g} s; count times from there, "
+                'or set start = {kind = "moving"}'
             )
 
 
@@ -223,7 +223,7 @@ class FirstRows(NamedTuple):
     bias: float
 
     def at(self, i: int) -> str:
-        return f"{self.table.at(self.rows[i])}, column `{self.name}`"
+        return f"{self.table.at(self.rows[i], self.name)}"
 
 
 def check_start(

@@ -101,7 +101,7 @@ def accepted(every: Sequence[Finding], acknowledged: Sequence[str]) -> list[Find
         )
     for one in every:
         if one.severity == "error" and one.facts["name"] not in acknowledged:
-            raise ValueError(f'{one} If it is right, say acknowledged = ["{one.facts["name"]}"]')
+            raise ValueError(f'{one} If it is right, set acknowledged = ["{one.facts["name"]}"]')
     return [replace(one, severity="note") for one in every]
 
 

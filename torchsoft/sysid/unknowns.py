@@ -335,7 +335,7 @@ def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
         if not math.isclose(value, own[0], rel_tol=1e-9):
             raise ValueError(
                 f"unknowns.{name}: it is {own[0]:g} in the rig of recording `{recordings[0].name}` "
-                f"and {value:g} in that of `{r.name}`: say by `nominal` where the search starts"
+                f"and {value:g} in that of `{r.name}`: set by `nominal` where the search starts"
             )
     return own[0]
 

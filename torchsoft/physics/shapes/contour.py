@@ -1,7 +1,7 @@
 """A body inside any smooth closed contour: a periodic cubic spline."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
@@ -30,6 +30,9 @@ FINE = 64
 LEAST, STEEPEST = 8, np.radians(60)
 """Points that are a contour, and by how much it may turn at one of them [rad]: a spline would swing
 around a corner."""
+
+WIDEST = 2.0
+"""Largest width [m] of the outline in a file: a wider one is in another unit than its heading."""
 
 PIECES = (32, 64, 128, 256, 512)
 """Allowed numbers of pieces of a contour; the tolerance decides."""
@@ -64,7 +67,6 @@ class Contour(Outlined):
     the nearest points cannot be told apart.
     """
 
-    given: ClassVar = "points"
     POINTS = 6
     """Quadrature points along a piece, whose moments are polynomials of degree 11."""
 
@@ -304,6 +306,11 @@ def read_points(path: str | Path) -> Array:
     if (empty := np.flatnonzero(np.isnan(points).any(1))).size:
         raise ValueError(
             f"{path}, row {table.rows[empty[0]]} has an empty cell; a point needs x and y"
+        )
+    if (width := np.ptp(points, axis=0).max()) > WIDEST:
+        raise ValueError(
+            f"{path}: the outline is {width:.3g} m wide; is the unit in the heading right? It must "
+            f"be at most {WIDEST:g} m wide"
         )
     return points
 

@@ -170,7 +170,6 @@ class RoundedPolygon(Rounded):
     3 to `MOST` places, for corners that do not fit on their sides, and for sides that cross.
     """
 
-    given: ClassVar = "vertices"
     MOST = 64
 
     def __init__(

@@ -140,9 +140,6 @@ class Outlined(Shape):
     """A shape given by points around it, about any point: its own frame has its origin at the
     centre of mass."""
 
-    given: ClassVar = ""
-    """Name of the constructor's argument with the points."""
-
     def moments(self) -> "Moments":
         """In the coordinates of the given points."""
         raise NotImplementedError
@@ -157,11 +154,10 @@ class Outlined(Shape):
         x, y = self.moments().centre.tolist()
         if max(abs(x), abs(y)) > NOTED:
             log.warning(
-                "the centre of mass is at (%.9g, %.9g) m of `%s`: the body's pose is that of this "
-                "point",
-                x,
-                y,
-                self.given,
+                "the centre of mass is at (%.3f, %.3f) mm in the outline's coordinates; x and y of "
+                "the body are those of this point",
+                1e3 * x,
+                1e3 * y,
             )
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
