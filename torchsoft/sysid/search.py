@@ -3,8 +3,8 @@
 1. Score tests of all suspects order them: those that would explain most come first, and those with
    costly runs last.
 2. Successive halving: every suspect of a bracket gets one step; then the best third goes on with
-   three times as many evaluations, until a few finalists are left. Suspects that explain as much by
-   their score tests are finalists, too.
+   three times as many evaluations, until a few finalists are left. The likeliest by its score test
+   is a finalist, too, and so are those whose score tests explain as much as the best fit.
 3. Finalists are fitted until they converge, on fine steps. The search ends after a bracket in which
    one explains the misfit, and when refits took all of the effort.
 """
@@ -37,7 +37,7 @@ FAR = 2.0
 """Misfit per sample above which rounds of halving have steps of the tolerance `LOOSE`, whose errors
 are small beside the misfit."""
 
-FAINT = 0.01
+FAINT = 0.05
 """Part of the misfit above the noise that a suspect explains by its score test to be in the first
 bracket, however large that is: far from the data score tests order suspects wrongly, and causes had
 0.16 and more."""
@@ -308,13 +308,14 @@ def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
 def comparable(
     first: Mapping[Suspect, Fit], tests: Mapping[str, AssumptionTest], fits: Mapping[Suspect, Fit]
 ) -> dict[Suspect, Fit]:
-    """The first steps with suspects that explain as much by their score tests as the best of some
-    fits: a few evaluations do not exclude them."""
+    """The first steps with the likeliest suspect by its score test, and with those that explain as
+    much by theirs as the best of some fits: a few evaluations do not exclude them."""
     most = min((fit.square for fit in fits.values()), default=0.0) + COMPARABLE
+    likeliest = max(first, key=lambda one: tests[one.name].gain, default=None)
     return {
         one: fit
         for one, fit in first.items()
-        if tests[one.name].passed and tests[one.name].left < most
+        if one is likeliest or (tests[one.name].passed and tests[one.name].left < most)
     }
 
 
