@@ -5,7 +5,7 @@ With all of them at their neutral values a rig moves as it did before. An identi
 for granted; each may be one of its unknowns.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from copy import copy
 from functools import partial
 from typing import NamedTuple, TypeVar
@@ -43,17 +43,31 @@ class Extension(NamedTuple):
 
 def extensions(rig: Rig) -> dict[str, Extension]:
     """Numbers that may be added to a rig, by the name of the parameter."""
-    out: dict[str, Extension] = {}
+    kinds = of_pads, of_materials, of_laws, of_contacts, of_guides, of_controllers, of_gravity
+    known = {*rig.names, *(own for own, _ in rig.named_parameters())}
+    return {name: one for kind in kinds for name, one in kind(rig) if name not in known}
+
+
+Named = Iterator[tuple[str, Extension]]
+"""Extensions with the names of their parameters."""
+
+
+def of_pads(rig: Rig) -> Named:
+    """Ratios of pads to their material."""
     for name in rig.pads if len(rig.pads) > 1 else ():
         for ratio, comparison, reach in (
             ("E_ratio", "as stiff", 2.0),
             ("tau_ratio", "as viscous", 4.0),
         ):
-            out[f"pads.{name}.{ratio}"] = Extension(
+            yield f"pads.{name}.{ratio}", Extension(
                 1.0, 0.01, 1 / reach, reach, "", f"the pad {name} is {comparison} as its material",
                 f"the pad {name} were 1.01 times {comparison} as its material",
                 partial(_pad_ratio, name=name, ratio=ratio),
             )  # fmt: skip
+
+
+def of_materials(rig: Rig) -> Named:
+    """Branches of materials, faster and slower than their own."""
     for stem, material in _shared(rig, Material):
         if any(pad.nodal for pad in rig.pads.values() if pad.material is material):
             continue
@@ -61,47 +75,65 @@ def extensions(rig: Rig) -> dict[str, Extension]:
         branches = {"fast": [FASTER * float(own.min())]}
         branches["slow"] = [factor * float(own.max()) for factor in SLOWER]
         for kind, time in ((kind, time) for kind, times in branches.items() for time in times):
-            out[f"{stem}.{kind}({time:.3g} s)"] = Extension(
+            yield f"{stem}.{kind}({time:.3g} s)", Extension(
                 0.0, 0.01, 0.0, 0.5, "", f"{stem} has no {kind}er branch",
                 f"0.01 of the compliance of {stem} set in over {time:.3g} s",
                 partial(_branch, stem=stem, time=time),
             )  # fmt: skip
-    laws: list[SoftContact] = []
+
+
+def _laws(rig: Rig) -> list[tuple[str, SoftContact]]:
+    """The distinct laws of a rig, with the stem of their parameters' names."""
+    out = list[tuple[str, SoftContact]]()
     for stem, law in _shared(rig, SoftContact):
-        if any(same_law(law, one) for one in laws):
-            continue
-        laws.append(law)
-        out[f"{stem}.power"] = Extension(
+        if not any(same_law(law, one) for _, one in out):
+            out.append((stem, law))
+    return out
+
+
+def of_laws(rig: Rig) -> Named:
+    """Laws of contacts."""
+    for stem, law in _laws(rig):
+        yield f"{stem}.power", Extension(
             1.0, 0.01, 0.6, 2.5, "", f"the penalty force of {stem} is linear in the depth",
             f"it grew with the depth to the power 1.01, the same at {REFERENCE_DEPTH:g} m",
             partial(_of_law, stem=stem, name="power", neutral=1.0),
         )  # fmt: skip
-        out[f"{stem}.adhesion"] = Extension(
+        yield f"{stem}.adhesion", Extension(
             0.0, 1e-3, 0.0, 1.0, "N", f"{stem} does not adhere",
             f"a point that touches adhered with 0.001 N per {1e3 * law.node_spacing:g} mm",
             partial(_of_law, stem=stem, name="adhesion", neutral=0.0),
         )  # fmt: skip
         for key in law.matched:
             value = float(getattr(law, key).detach())
-            out[f"{stem}.{key}"] = Extension(
+            yield f"{stem}.{key}", Extension(
                 value, 0.01 * value, 0.01 * value, 100.0 * value, "N/m" if "K" in key else "N.s/m",
                 f"{key} of {stem} is matched to the pads", f"it were {1.01 * value:.6g}",
                 partial(_of_law, stem=stem, name=key, neutral=value),
             )  # fmt: skip
         friction = law.friction  # of this class, and none that a user derives from it
         if type(friction) is SmoothSlip and friction.R_pad is None:
-            out[f"{stem}.friction.ageing"] = Extension(
+            yield f"{stem}.friction.ageing", Extension(
                 0.0, 2e-3, 0.0, 0.5, "", f"friction of {stem} does not age",
                 "static friction grew by 0.002 for every factor e of the time at rest",
                 partial(_ageing, stem=stem),
             )  # fmt: skip
+
+
+def of_contacts(rig: Rig) -> Named:
+    """Friction of single contacts that share a law."""
+    for _, law in _laws(rig):
         users = [name for name, one in rig.contacts.items() if same_law(one.law, law)]
         for name in users if len(users) > 1 else ():
-            out[f"contacts.{name}.friction_ratio"] = Extension(
+            yield f"contacts.{name}.friction_ratio", Extension(
                 1.0, 0.01, 0.2, 5.0, "", f"friction of the contact {name} is that of its law",
                 f"friction of the contact {name} were 1.01 times that of its law",
                 partial(_friction_ratio, name=name),
             )  # fmt: skip
+
+
+def of_guides(rig: Rig) -> Named:
+    """Friction and damping of guides."""
     for coordinate in _guided(rig):
         turns = coordinate.endswith(".theta")
         for kind, size, most in (("friction", 0.1, 50.0), ("damping", 1.0, 500.0)):
@@ -109,28 +141,34 @@ def extensions(rig: Rig) -> dict[str, Extension]:
                 "" if kind == "friction" else ".s/rad" if turns else ".s/m"
             )
             part = 0.02 if turns else 1.0  # m: of the arm at which a guide acts
-            out[f"guides.{coordinate}.{kind}"] = Extension(
+            yield f"guides.{coordinate}.{kind}", Extension(
                 0.0, part * size, 0.0, part * most, unit, f"{coordinate} has no {kind}",
                 f"its guide had a {kind} of {part * size:g} {unit}",
                 partial(_guide, coordinate=coordinate, kind=kind),
             )  # fmt: skip
+
+
+def of_controllers(rig: Rig) -> Named:
+    """Lags of controllers."""
     loops = [name for name, one in rig.actuators.items() if isinstance(undelayed(one), PD)]
     several = {"actuators": loops} if len(loops) > 1 else {}
     for stem, names in (several | {f"actuators.{name}": [name] for name in loops}).items():
         who = "controllers push" if len(names) > 1 else f"the controller {names[0]} pushes"
-        out[f"{stem}.lag"] = Extension(
+        yield f"{stem}.lag", Extension(
             0.0, 1e-4, 0.0, 0.02, "s", f"{who} without delay",
             "it came late, by a lag, a delay or half the period of a hold",
             partial(_lag, names=names),
         )  # fmt: skip
+
+
+def of_gravity(rig: Rig) -> Named:
+    """Direction of gravity."""
     tilted = [name for name, body in rig.bodies.items() if body.weighted and _free(rig, name, "x")]
     if tilted and rig.gravity.item() > 0:
-        out["gravity_tilt"] = Extension(
+        yield "gravity_tilt", Extension(
             0.0, 1e-3, -0.2, 0.2, "rad", "gravity acts along -y",
             "it were turned by 1 mrad, anticlockwise", partial(_tilt, bodies=tilted),
         )  # fmt: skip
-    known = {*rig.names, *(own for own, _ in rig.named_parameters())}
-    return {name: one for name, one in out.items() if name not in known}
 
 
 def extend(rig: Rig, names: Collection[str]) -> None:
