@@ -11,9 +11,9 @@ Command: .venv/bin/python -m experiments.grasp_and_roll [--smoke]
 Expected (default set; the paper's number in brackets): grasping force 80.85 N; x_C(10 s) = 40.000
 mm (40); y_C in the grasp 23.199 mm (23.20); y_Br between 48.564 and 48.600 mm (48.6); theta(10 s) =
 1.090 rad, anticlockwise, -0.0035 rad at the end; peak speed 4.41 mm/s; peak F_x 0.43 N, of which a
-quarter is the mesh's: 0.33 N with four contact points an element; peak bracket moment 1.56 N.m; 11
+quarter is the mesh's: 0.33 N with four contact points per element; peak bracket moment 1.56 N.m; 11
 nodes of each pad in contact; energy residual 1e-6. About 40 s on one core with figures and
-animation; each simulation takes 2 s of that, with four points an element 7 s.
+animation; each simulation takes 2 s of that, with four points per element 7 s.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,7 +57,7 @@ GUESS, HELD = 80.0, 0.1
 """First guess of the grasping force, and the accuracy to which it is found [N]."""
 
 POINTS = 4
-"""Contact points an element of the finer run, whose peak of F_x is within 2 % of that of eight."""
+"""Contact points per element of the finer run, whose peak of F_x is within 2 % of that of eight."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ PUBLISHED = {
     "y_Br from 0.5 s on, lowest [mm]": "48.6", "y_Br from 0.5 s on, highest [mm]": "48.6",
     "peak speed of the disc [mm/s]": "4.375 (desired)",
     "direction of rolling out": "anticlockwise", "grasping force fed forward [N]": "not given",
-    "energy residual / injected": "-", "steps": "-", "Newton iterations a step": "-",
+    "energy residual / injected": "-", "steps": "-", "Newton iterations per step": "-",
     "wall time of the stepping [s]": "-",
 }  # fmt: skip
 """Numbers that the paper prints; of others it has curves only."""
@@ -149,14 +149,14 @@ def quantities(run: Run) -> dict[str, float | str | None]:
         "theta(30 s) [rad]": at(30, "theta_C"),
         "downward force F_y at 5 s [N]": at(5, "effort_y", -1.0),
         "peak horizontal force F_x [N], contact points on nodes": r["effort_x"].abs().max().item(),
-        f"the same, {POINTS} points an element": run.finer["effort_x"].abs().max().item(),
+        f"the same, {POINTS} points per element": run.finer["effort_x"].abs().max().item(),
         "peak bracket moment [N.m]": r["M_U"].abs().max().item(),
         "nodes in contact at 5 s, lower pad": touching("L"),
         "nodes in contact at 5 s, upper pad": touching("U"),
         "grasping force fed forward [N]": run.grasp_force,
         "energy residual / injected": r.energy_residual_rel,
         "steps": r.stats.steps,
-        "Newton iterations a step": r.stats.newton_per_step,
+        "Newton iterations per step": r.stats.newton_per_step,
         "wall time of the stepping [s]": r.stats.wall_s,
     }
 
