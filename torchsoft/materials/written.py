@@ -67,6 +67,7 @@ def toml(found: Found, assumed: Mapping[str, float], options: Mapping[str, objec
     notes = {"tau_instant": ", small: the instantaneous spring's"}
     if "times" in table:
         notes["tau"] = ", small beside the times"
+    origins = {k: "assumed" if options.get(k) is None else "stated" for k in assumed}
     comments = [
         f"From {path.name} ({found.test} test) by torchsoft {version('torchsoft')}.",
         *found.notices,
@@ -78,9 +79,8 @@ def toml(found: Found, assumed: Mapping[str, float], options: Mapping[str, objec
         f'kind = "{found.kind}"',
         *(toml_row(k, x, f"[{UNITS[k]}]{notes.get(k, '')}") for k, x in table.items()),
         *(
-            toml_row(k, x, f"[{UNITS[k]}] not of this {found.test} test: {origin}")
+            toml_row(k, x, f"[{UNITS[k]}] not of this {found.test} test: {origins[k]}")
             for k, x in assumed.items()
-            for origin in ("assumed" if options.get(k) is None else "stated",)
         ),
     ]
     return "\n".join(rows) + "\n"

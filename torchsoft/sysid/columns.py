@@ -289,6 +289,6 @@ def check_table(table: Columns) -> Columns:
     for i in np.flatnonzero(apart < ROUNDED * np.abs(t).max())[:1]:
         raise ValueError(
             f"{table.at(i + 1, 't')}: {t[i + 1]:.9g} s is too far from zero to be told from "
-            " the time before it; count times from the start"
+            "the time before it; count times from the start"
         )
     return table

@@ -43,7 +43,7 @@ class Extension(NamedTuple):
 
 def extensions(rig: Rig) -> dict[str, Extension]:
     """Numbers that may be added to a rig, by the name of the parameter."""
-    kinds = of_pads, of_materials, of_laws, of_contacts, of_guides, of_controllers, of_gravity
+    kinds = of_pads, of_materials, of_laws, of_guides, of_controllers, of_gravity
     known = {*rig.names, *(own for own, _ in rig.named_parameters())}
     return {name: one for kind in kinds for name, one in kind(rig) if name not in known}
 
@@ -82,18 +82,13 @@ def of_materials(rig: Rig) -> Named:
             )  # fmt: skip
 
 
-def _laws(rig: Rig) -> list[tuple[str, SoftContact]]:
-    """The distinct laws of a rig, with the stem of their parameters' names."""
-    out = list[tuple[str, SoftContact]]()
-    for stem, law in _shared(rig, SoftContact):
-        if not any(same_law(law, one) for _, one in out):
-            out.append((stem, law))
-    return out
-
-
 def of_laws(rig: Rig) -> Named:
-    """Laws of contacts."""
-    for stem, law in _laws(rig):
+    """Laws of contacts, and friction of single contacts that share one."""
+    laws = list[SoftContact]()
+    for stem, law in _shared(rig, SoftContact):
+        if any(same_law(law, one) for one in laws):
+            continue
+        laws.append(law)
         yield f"{stem}.power", Extension(
             1.0, 0.01, 0.6, 2.5, "", f"the penalty force of {stem} is linear in the depth",
             f"it grew with the depth to the power 1.01, the same at {REFERENCE_DEPTH:g} m",
@@ -118,11 +113,6 @@ def of_laws(rig: Rig) -> Named:
                 "static friction grew by 0.002 for every factor e of the time at rest",
                 partial(_ageing, stem=stem),
             )  # fmt: skip
-
-
-def of_contacts(rig: Rig) -> Named:
-    """Friction of single contacts that share a law."""
-    for _, law in _laws(rig):
         users = [name for name, one in rig.contacts.items() if same_law(one.law, law)]
         for name in users if len(users) > 1 else ():
             yield f"contacts.{name}.friction_ratio", Extension(

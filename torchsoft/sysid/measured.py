@@ -223,7 +223,7 @@ class FirstRows(NamedTuple):
     bias: float
 
     def at(self, i: int) -> str:
-        return f"{self.table.at(self.rows[i], self.name)}"
+        return self.table.at(self.rows[i], self.name)
 
 
 def check_start(
