@@ -1,5 +1,6 @@
 """Frame of a program: options from the command line, repetitions, tables, and `summary.json`."""
 
+import math
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -66,10 +67,15 @@ def numbers(title: str, rows: Mapping[str, Mapping[str, float]], form: str = ".4
     """A table of numbers: one row for each of `rows`, one column for each name in the first."""
     names = list(next(iter(rows.values())))
     cells = [
-        (key, *(f"{row[name]:{form}}" if name in row else "" for name in names))
+        (key, *(written(row[name], form) if name in row else "" for name in names))
         for key, row in rows.items()
     ]
     return Table((title, *names), cells)
+
+
+def written(value: float, form: str) -> str:
+    """A number in a form; "nan" and "inf" as they are, without a sign or a unit."""
+    return f"{value:{form}}" if math.isfinite(value) else str(value)
 
 
 @cache

@@ -405,6 +405,21 @@ def table(cases: list[dict[str, Any]]) -> Table:
     return Table(head, rows)
 
 
+OUTCOMES = "named", "unconfirmed", "doubtful", "none", "holds", "false cause"
+
+
+def outcomes(cases: list[dict[str, Any]]) -> Table:
+    """Repetitions by the outcome of `FROZEN`, a row each, and by their own, a column each."""
+    pairs = Counter[tuple[str, str]]()
+    for one in cases:
+        for outcome, count in one["outcomes"].items():
+            pairs[one["frozen"], outcome] += count
+    before, now = ([one for one in OUTCOMES if any(pair[k] == one for pair in pairs)]
+                   for k in (0, 1))  # fmt: skip
+    rows = [[was, *(str(pairs[was, one] or "") for one in now)] for was in before]
+    return Table(("before", *now), rows)
+
+
 def study(cases: Sequence[Case], config: Settings, name: str) -> None:
     """Make the recordings of all cases, identify them from every seed, and write their table."""
     made = make_all((o for case in cases for o in case.orders), config.step, config.workers)
@@ -414,7 +429,10 @@ def study(cases: Sequence[Case], config: Settings, name: str) -> None:
         one = lambda seed, case=case, runs=runs: repeat(case, runs, config.first + seed, config)
         done.append(summed(case, repeated(one, config.seeds, config.workers, case.name)))
         totals = {what: sum(row[what] for row in done) for what in ("silent", "false")}
-        write(config, {**totals, "cases": done}, {name: table(done)})
+        tables = {name: table(done)}
+        if any(row["frozen"] for row in done):
+            tables["outcomes"] = outcomes(done)
+        write(config, {**totals, "cases": done}, tables)
 
 
 def main(config: Config) -> None:
