@@ -222,14 +222,15 @@ def search(
         size = max(BRACKET, sum(tests[one.name].gain >= least for one in queue if not one.costly))
         while queue and end.runner.work < most:
             bracket, queue = queue[:size], queue[size:]
-            first, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
-            fits = first
+            reached, evaluations = first_steps(end, bracket, tests, linear, bar), KEPT  # 2.
+            fits = reached
             while len(fits) > FINALISTS:
                 kept = best_of(fits, linear)
                 bar.set_description(f"{len(kept)} suspects, {evaluations} evaluations each")
                 fits = {one: carried_on(fits[one], evaluations) for one in kept}
+                reached = reached | fits
                 evaluations *= KEPT
-            fits = comparable(first, tests, fits) | fits
+            fits = comparable(reached, tests, fits) | fits
             dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
             yield from ((test, None) for test in dropped)
             explained = False
@@ -306,15 +307,16 @@ def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
 
 
 def comparable(
-    first: Mapping[Suspect, Fit], tests: Mapping[str, AssumptionTest], fits: Mapping[Suspect, Fit]
+    reached: Mapping[Suspect, Fit], tests: Mapping[str, AssumptionTest], fits: Mapping[Suspect, Fit]
 ) -> dict[Suspect, Fit]:
-    """The first steps with the likeliest suspect by its score test, and with those that explain as
-    much by theirs as the best of some fits: a few evaluations do not exclude them."""
+    """Of the fits that a bracket `reached`, that with the likeliest suspect by its score test, and
+    those that explain as much by theirs as the best of some `fits`: a few evaluations do not
+    exclude them."""
     most = min((fit.square for fit in fits.values()), default=0.0) + COMPARABLE
-    likeliest = max(first, key=lambda one: tests[one.name].gain, default=None)
+    likeliest = max(reached, key=lambda one: tests[one.name].gain, default=None)
     return {
         one: fit
-        for one, fit in first.items()
+        for one, fit in reached.items()
         if one is likeliest or (tests[one.name].passed and tests[one.name].left < most)
     }
 
