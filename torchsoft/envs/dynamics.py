@@ -316,7 +316,8 @@ class Dynamics:
             stepper = stepper.following(own)
         elif motion.known and not steps_are_given and not torch.is_grad_enabled():
             first, last = t.numpy()[[0, -1]]
-            places = [self.rig.signals.index(name) for name in self._set_by]
+            signals = self.rig.signals
+            places = [signals.index(name) for name in self._set_by]
             stepper = stepper.moving(motion.on_lines(places, first, last, values.numpy()), first)
         else:
             stepper = stepper.following(self._following(own, t[[0, -1]], values))
