@@ -150,12 +150,16 @@ def test_a_run_from_a_state_of_the_pads_has_no_other_pads():
 
 
 def test_a_camera_has_a_scale_about_zero_or_its_first_sample():
-    data, places = strokes(), {**SENSORS, "y_Br": Sensor(noise=1e-5)}
-    _, x = data.samples["x_C"]
+    data, places = strokes(), {**SENSORS, **dict.fromkeys(("y_C", "x_Br"), Sensor(noise=1e-5))}
+    t, x = data.samples["x_C"]
+    data = replace(data, samples=data.samples | {"x_Br": (t, x)})
     for name, zero in (("scale of the camera", 0.0), ("scale about the start of the camera", x[0])):
         samples = changed(data, name, 0.01, sensors=places).samples
         np.testing.assert_allclose(samples["x_C"][1], x - 0.01 * (x - zero))
         assert samples["effort_x"] is data.samples["effort_x"]
+    samples = changed(data, "scale of the camera on disc", 0.01, sensors=places).samples
+    np.testing.assert_allclose(samples["x_C"][1], 0.99 * x)
+    assert samples["x_Br"] is data.samples["x_Br"]
 
 
 def test_a_camera_that_is_turned_mixes_coordinates_about_their_first_samples():

@@ -357,22 +357,24 @@ def has_partner(recording: Recording, channel: str) -> bool:
 
 
 def of_cameras(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Suspect]:
-    """Scale and angle of a camera that measures several coordinates."""
+    """Scale and angle of cameras: one that measures the places of all bodies, or of one."""
     places = [channel for channel in sensors if recording.units.get(channel) == "m"]
-    if len(places) > 1:
+    symbols = recording.rig.symbols.items()
+    pairs = {f"the camera on {body}": (f"x_{one}", f"y_{one}") for body, one in symbols}
+    pairs = {camera: pair for camera, pair in pairs.items() if {*pair} <= {*places}}
+    others = {camera: pair for camera, pair in pairs.items() if {*pair} != {*places}}
+    seen: dict[str, Sequence[str]] = {"the camera": places} if len(places) > 1 else {}
+    for camera, channels in (seen | others).items():
         for name, about in (("scale", "zero"), ("scale about the start", "their first sample")):
             yield by_amount(
-                f"{name} of the camera", f"{', '.join(places)} have one true scale",
+                f"{name} of {camera}", f"{', '.join(channels)} have one true scale",
                 f"they were all too large about {about}", ZOOM, PERCENT, "%",
-                partial(zoomed, channels=places, about_start=about != "zero"), kind="sensor",
+                partial(zoomed, channels=channels, about_start=about != "zero"), kind="sensor",
                 of_samples=True,
             )  # fmt: skip
-    for body, symbol in recording.rig.symbols.items():
-        pair = f"x_{symbol}", f"y_{symbol}"
-        if {*pair} <= {*places}:
-            yield by_amount(
-                f"angle of the camera on {body}",
-                f"{pair[0]} and {pair[1]} are along the axes of the rig",
-                "their camera were turned anticlockwise about its own axis", TILT, MILLI, "mrad",
-                partial(turned, pair=pair), kind="sensor", of_samples=True,
-            )  # fmt: skip
+    for camera, pair in pairs.items():
+        yield by_amount(
+            f"angle of {camera}", f"{pair[0]} and {pair[1]} are along the axes of the rig",
+            "their camera were turned anticlockwise about its own axis", TILT, MILLI, "mrad",
+            partial(turned, pair=pair), kind="sensor", of_samples=True,
+        )  # fmt: skip
