@@ -101,7 +101,7 @@ def test_shaking_is_along_and_across():
 @pytest.mark.parametrize(
     ("rig", "how", "words"),
     [
-        ("two_fingers", {}, "left and right do; say which `body`"),
+        ("two_fingers", {}, "left and right do; set `body` to one of them"),
         ("drop", {}, "across the pad and along it: none does"),
         ("paper", {"body": "disc"}, "along it: none does"),
     ],

@@ -224,6 +224,10 @@ def test_a_step_that_newton_does_not_solve_is_halved_and_differentiated(monkeypa
     assert 5 < run.stats.steps < 5 + 64 * failed
     again = simulate(model, t, y0=y0, knots=run.knots, tolerance=1e-10)
     assert float((again.y - run.y).detach().abs().max()) < 1e-8
+    with pytest.warns(UserWarning, match="halved"):  # four outputs a step
+        within = simulate(model, times(0.01, 21), y0=y0, knots=t, tolerance=1e-10)
+    assert within.stats.failed_steps == failed
+    np.testing.assert_allclose(within.y.detach()[::4], run.y.detach(), atol=1e-8)
     (slope,) = torch.autograd.grad(run["theta"][-1], E)
     ahead = go(gradient="forward", wrt=["pad.E"], rigid=True)
     assert ahead.stats.failed_steps == failed

@@ -99,7 +99,7 @@ def warn_of_moments(rig: Graph, y: Tensor, bodies: Starts) -> None:
         if abs(moment) > MOMENT_ARM * shape.size() * pressed:
             warn(
                 f"`{name}` is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a "
-                'run from here begins with that; say theta = "rest", or another angle',
+                'run from here begins with that; set theta = "rest", or another angle',
             )
 
 

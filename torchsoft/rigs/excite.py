@@ -151,7 +151,7 @@ def _presser(file: RigFile, body: str | None) -> tuple[str, str, float]:
             i = int(normal.abs().argmax())
             found[base] = COORDINATES[i], float(normal[i].sign())
     if len(found) != 1:
-        there = f"{' and '.join(found)} do; say which `body`" if found else "none does"
+        there = f"{' and '.join(found)} do; set `body` to one of them" if found else "none does"
         raise ValueError(
             "an excitation needs a body with a pad that two loops move, across the pad and along "
             f"it: {there}"

@@ -377,7 +377,7 @@ def read_column(
             shown = ", ".join(f"`{line(one, 40)}`" for one in there) or "nothing"
             raise ValueError(
                 f"{path} has no column `{name} [{'s' if name == time else unit}]`, in this "
-                f"unit or one like it; it has {shown}; say which one in "
+                f"unit or one like it; it has {shown}; name the right one in "
                 f"`{'time' if name == time else 'column'}`"
             )
     times, values = table.values[time], table.values[column]

@@ -328,8 +328,8 @@ class FileTable(Group):
             found = tree if isinstance(tree, dict) else {}
             if self.name is None and len(found) != 1:
                 raise ValueError(
-                    f"{path} has {len(found)} tables [materials.*]; say by name which one is "
-                    "meant, or one"
+                    f"{path} has {len(found)} tables [materials.*]; set `name` to the one "
+                    "that is meant"
                 )
             name = next(iter(found)) if self.name is None else self.name
             if name not in found:

@@ -342,7 +342,7 @@ class ImplicitStepper:
         pad = self.rig.pads[contact.pad]
         height, apart = f"{1e3 * pad.mesh.height:.3g} mm", 1e3 * float(pad.point_lengths.max())
         lost, of = f"`{contact.body}` was lost:", f"the pad `{contact.pad}`"
-        leave = f"say may_leave = true of the contact `{name}` if the body may be there"
+        leave = f"set may_leave = true in the contact `{name}` if the body may be there"
         return {
             OFF_THE_PAD: f"{lost} its contact reached the end of {of}, which is "
             f"{1e3 * pad.mesh.length:.3g} mm long; take a longer pad, or {leave}",

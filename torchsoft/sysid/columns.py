@@ -206,7 +206,7 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
     meant = f": did you mean `{plain[near]}`? If" if near else "; if"
     return (
         f"{meant} it has nothing to do with the motion, set ignore = [{shown(name)}]; if it is one "
-        f"under another name, say which in [columns]; {known}"
+        f"under another name, state that in [columns]; {known}"
     )
 
 
