@@ -36,6 +36,12 @@ SMALLEST = 0.5
 """Smallest stretch, and the inverse of the largest, in which stability is looked for, if the tables
 do not go further."""
 
+AT_ONE_SPEED = (
+    "the modulus is that at the speed of this test (a slower one gives less, a faster one more); "
+    "for the time dependence, fit a relaxation, creep or frequency test"
+)
+"""Sentence on the modulus of a tensile test."""
+
 
 @dataclass(frozen=True)
 class PullFit:
@@ -299,7 +305,4 @@ def notices(
     ]
     if extreme:
         yield f"at the limit of exponents, {limit:g}: {', '.join(extreme)}; take fewer terms"
-    yield (
-        "the specimen is taken as incompressible; the modulus belongs to the speed of this test. "
-        "For the time dependence, fit a relaxation, creep or frequency test."
-    )
+    yield f"the specimen is taken as incompressible; {AT_ONE_SPEED}"

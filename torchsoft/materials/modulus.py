@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from torchsoft.materials.energies import PullFit
+from torchsoft.materials.energies import AT_ONE_SPEED, PullFit
 from torchsoft.materials.measured import SMALL_STRAIN, Pull
 
 CURVED = 0.1
@@ -31,10 +31,7 @@ def modulus(pull: Pull) -> PullFit:
 
 def notices(pull: Pull, E: float) -> list[str]:
     """Sentences on assumptions."""
-    sentences = [
-        "a modulus at the speed of this test: a slower one gives less, a faster one more. For "
-        "the time dependence, fit a relaxation, creep or frequency test"
-    ]
+    sentences = [AT_ONE_SPEED]
     parabola = np.polyder(np.polyfit(pull.strain, pull.stress, 2))
     first, last = np.polyval(parabola, pull.strain[[0, -1]]).tolist()
     if abs(last - first) > CURVED * E:

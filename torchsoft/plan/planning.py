@@ -237,7 +237,10 @@ def obstacles(search: Search, run: Trajectory) -> list[str]:
     may move, and a run that fails."""
     variables, targets = search.evaluator.variables, search.found.errors.shape[1]
     since = min((one.after for one in variables.moves.bounds.values()), default=0.0)
-    few = f"free: more targets ({targets}) than values ({variables.n}): add knots, or free a parameter"
+    few = (
+        f"free: more targets ({targets}) than values ({variables.n}): add knots, or free a "
+        "parameter"
+    )
     return [
         *([few] if variables.n < targets else []),
         *variables.active(search.found.z),

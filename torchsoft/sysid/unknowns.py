@@ -214,7 +214,8 @@ def in_full(rigs: Sequence[Rig], given: Mapping[str, T]) -> dict[str, T]:
         meanings = sorted({rig.short[name] for rig in rigs if name in rig.short})
         if len(meanings) > 1:
             raise ValueError(
-                f"`{name}` is short for {' and '.join(meanings)} in different rigs; give the full name"
+                f"`{name}` is short for {' and '.join(meanings)} in different rigs; give the full "
+                "name"
             )
         (full,) = meanings or [name]
         if full in out:
