@@ -22,11 +22,11 @@ from torchsoft.display import hidden
 from torchsoft.sysid.assumption_tests import EVIDENT, AssumptionTest, Linearised
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
-from torchsoft.sysid.plan import LOOSE, USUAL, continued, refine_steps, scanned
 from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import EARLY
+from torchsoft.sysid.stages import LOOSE, USUAL, continued, refine_steps, scanned
 from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
