@@ -5,8 +5,9 @@
 2. Successive halving: every suspect of a bracket gets one step; then the best third goes on with
    three times as many evaluations, until a few finalists are left. The likeliest by its score test
    is a finalist, too, and so are those whose score tests explain as much as the best fit.
-3. Finalists are fitted until they converge, on fine steps, the best one first. The search ends after
-   a bracket in which one explains the misfit, or when refits took all of the effort and none does.
+3. Finalists are fitted until they converge, on fine steps, the best one first. The search ends
+   after a bracket in which one explains the misfit, or when refits took all of the effort and none
+   does.
 """
 
 import warnings
