@@ -49,7 +49,7 @@ PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
 Assumed = Literal["checked", "explained", "trusted"]
 """Whether assumptions get score tests, score tests and refits that look for a cause, or no test."""
 
-EFFORT = 3.0
+EFFORT = 2.0
 """Work of refits, over that of the fit itself, after which `explain` starts no other."""
 
 
