@@ -49,9 +49,6 @@ KEPT = 3
 COMPLETE, ROUGH = 20, 1e-3
 """Most evaluations of a finalist, and its relative tolerance."""
 
-TIGHTENINGS = 2
-"""Most times that a finalist goes on with a tenth of its tolerance."""
-
 COMPARABLE = 2 * EVIDENT
 """A finalist that leaves more than this beyond the best one is stopped: `EVIDENT`, and as much for
 the error of its steps."""
@@ -236,7 +233,7 @@ def search(
             dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
             yield from ((test, None) for test in dropped)
             explained = False
-            for one, refit in refits(fits, finest, bar):  # 3.
+            for one, refit in refits(fits, finest, linear, bar):  # 3.
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
                 explained = explained or bool(test.suspected and test.passed)
@@ -304,9 +301,9 @@ def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
     explains the misfit."""
     ranked = sorted(fits, key=lambda one: fits[one].square)
     kept = ranked[: max(len(ranked) // KEPT, FINALISTS)]
-    gains = {one: linear.square - fits[one].square for one in kept}
-    if gains[kept[0]] < max(NEARLY * (linear.square - linear.dof), EVIDENT):
+    if not seems_to_explain(fits[kept[0]], linear):
         return kept
+    gains = {one: linear.square - fits[one].square for one in kept}
     return [one for one in kept if gains[one] >= RIVAL * gains[kept[0]]]
 
 
@@ -333,13 +330,13 @@ def carried_on(fit: Fit, evaluations: int) -> Fit:
 
 
 def refits(
-    fits: Mapping[Suspect, Fit], finest: float, bar: "tqdm[Any]"
+    fits: Mapping[Suspect, Fit], finest: float, linear: Linearised, bar: "tqdm[Any]"
 ) -> Iterator[tuple[Suspect, Fit]]:
     """The fits, completed, the one that leaves least first."""
     best = np.inf
     for one in sorted(fits, key=lambda one: fits[one].square):
         bar.set_description(plain(f"refit with {one.name} free"))
-        refit = completed(fits[one], finest, best + COMPARABLE)
+        refit = completed(fits[one], finest, best + COMPARABLE, linear)
         best = min(best, refit.square)
         yield one, refit
 
@@ -350,13 +347,22 @@ def on_loose_steps(end: Fit) -> Fit:
     return end if at.failed else end._replace(at=at)
 
 
-def completed(fit: Fit, finest: float, most: float) -> Fit:
+def completed(fit: Fit, finest: float, most: float, linear: Linearised) -> Fit:
     """The fit, continued until it converges, with ratios at a bound scanned over their whole range;
-    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares."""
+    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares, or of a
+    tenth of it where they matter. One that seems to explain the misfit may take another tenth."""
     c = fit.problem.coordinates
     stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
     stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
     end = continued(fit, stage) or fit
     if end.square > most:
         return end._replace(converged=False)
-    return refine_steps(end.by(finest), TIGHTENINGS if end.loss == "linear" else 0)
+    if end.loss != "linear":
+        return refine_steps(end.by(finest), 0)
+    end = refine_steps(end.by(finest), 1)
+    return refine_steps(end, 1) if seems_to_explain(end, linear) else end
+
+
+def seems_to_explain(fit: Fit, linear: Linearised) -> bool:
+    """Whether a fit explains nearly all of the misfit above the noise."""
+    return linear.square - fit.square >= max(NEARLY * (linear.square - linear.dof), EVIDENT)
