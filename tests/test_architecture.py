@@ -36,10 +36,10 @@ FLOWS = {
         sentences extensions
         initial_state recording unknowns noise prediction runs alternatives assumptions problem
         first_samples
-        synthetic fit plan prechecks
-        residual_tests colour assumption_tests search sensitivity suspects estimate
+        synthetic fit stages prechecks
+        residual_tests colour assumption_tests search assumption_checks suspect_findings estimate
         result profile conclusion identification compare
-        planner columns configuration measured design figures report .
+        design_criterion columns configuration measured design figures report .
     """,
     "testing": "energy laws gradients .",
     "plan": "knots problem search sqp planning .",

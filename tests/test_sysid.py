@@ -22,9 +22,9 @@ from torchsoft.sysid import (
     record,
 )
 from torchsoft.sysid.fit import Fit, gauss_newton
-from torchsoft.sysid.plan import default_plan, jacobian_error, refine_steps, run_plan, run_stage
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.stages import default_plan, jacobian_error, refine_steps, run_plan, run_stage
 
 BASE, SENSORS = PAPER.override(COARSE), RIG
 GRASP = {"duration": 0.65, "grasp": 0.2, "since": 0.25}

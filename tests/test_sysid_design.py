@@ -23,7 +23,7 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 from torchsoft.sysid.configuration import read_config
 from torchsoft.sysid.design import AS_STATED, design, planned, rank
-from torchsoft.sysid.planner import LEFT, Planner, chosen, optimality
+from torchsoft.sysid.design_criterion import LEFT, DesignEvaluator, chosen, optimality
 from torchsoft.sysid.runs import Runner
 
 P, DEPTH = PAPER.override(COARSE), 1e-3
@@ -60,10 +60,10 @@ def problem(plan):
     return Problem([plan], SENSORS, BOTH)
 
 
-def planner(problem: Problem, **limits: tuple[float, float]) -> Planner:
+def evaluator(problem: Problem, **limits: tuple[float, float]) -> DesignEvaluator:
     recording = problem.recordings[0]
     moves = Moves(recording.rig.reference, BOUNDS, float(recording.times[-1]))
-    return Planner(problem, recording.name, moves, limits, "A", None, 1e-4, 1)
+    return DesignEvaluator(problem, recording.name, moves, limits, "A", None, 1e-4, 1)
 
 
 def jacobian(problem: Problem) -> np.ndarray:
@@ -92,9 +92,9 @@ def test_a_criterion_has_its_derivative_and_is_a_logarithm_of_deviations(criteri
 def test_slopes_are_those_of_differences(plan, monkeypatch):
     """Of values of the knots, with what excess costs; a sensor's gain and bias are fitted
     beside the parameters."""
-    monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
+    monkeypatch.setattr("torchsoft.sysid.design_criterion.DIFFERENCE", 1e-4)
     faulty = {"effort_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}
-    one = planner(Problem([plan], SENSORS | faulty, BOTH), F_y=(-30.0, 30.0))
+    one = evaluator(Problem([plan], SENSORS | faulty, BOTH), F_y=(-30.0, 30.0))
     z = one.moves.start
     at = one.evaluate(z)
     assert at.peaks["effort_y"] > 1
@@ -108,7 +108,7 @@ def test_errors_of_steps_and_of_linearising_count(plan):
     """Sensors ten thousand times as good see the steps, and what a covariance promises is not
     there."""
     sensors = {name: Sensor(noise=one.noise / 4e4) for name, one in SENSORS.items()}
-    one = planner(Problem([plan], sensors, BOTH))
+    one = evaluator(Problem([plan], sensors, BOTH))
     at = one.evaluate(one.moves.start)
     sd = np.array(list(at.deviations.values()))
     size = np.mean(sd**2 + LEFT**2 * (at.errors**2).mean(0))
@@ -159,7 +159,7 @@ def test_a_search_leaves_out_what_cannot_be_run_and_keeps_the_best_when_interrup
     problem, monkeypatch
 ):
     """The motion given must run."""
-    evaluate, slopes = Planner.evaluate, Planner.slopes
+    evaluate, slopes = DesignEvaluator.evaluate, DesignEvaluator.slopes
     lost, stops = cycle([False, False, True]), iter([False, True])
 
     def sometimes(self, *given):
@@ -172,8 +172,8 @@ def test_a_search_leaves_out_what_cannot_be_run_and_keeps_the_best_when_interrup
             raise KeyboardInterrupt
         return slopes(self, *given)
 
-    monkeypatch.setattr(Planner, "evaluate", sometimes)
-    monkeypatch.setattr(Planner, "slopes", interrupted)
+    monkeypatch.setattr(DesignEvaluator, "evaluate", sometimes)
+    monkeypatch.setattr(DesignEvaluator, "slopes", interrupted)
     found = design(problem, "plan", BOUNDS, iterations=50)
     assert [one.code for one in found.findings] == ["design-interrupted", "design-failed"]
     assert str(found.findings[0]) == "Interrupted after 1 of 50 iterations."

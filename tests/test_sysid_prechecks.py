@@ -18,7 +18,6 @@ from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.rigs.excite import Excitation
 from torchsoft.sysid import Problem, Recording, Sensor, Unknown, identify, record
-from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prechecks import (
     accepted,
     controller_findings,
@@ -31,6 +30,7 @@ from torchsoft.sysid.prechecks import (
 from torchsoft.sysid.prediction import Prediction, readout
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
+from torchsoft.sysid.stages import LOOSE
 
 NOMINAL = PAPER.override(COARSE)
 SENSORS = RIG | {"omega_C": Sensor(noise=0.02)}

@@ -26,8 +26,8 @@ from torchsoft.sysid import (
     explain,
     identify,
     record,
-    suspects,
 )
+from torchsoft.sysid.assumption_checks import Checked, with_scores
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.conclusion import estimate_findings, ordering_constraints, step_findings
 from torchsoft.sysid.estimate import Quantity
@@ -35,8 +35,8 @@ from torchsoft.sysid.fit import Check
 from torchsoft.sysid.residual_tests import ResidualTest
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.search import best_of
-from torchsoft.sysid.sensitivity import Checked, with_scores
-from torchsoft.sysid.suspects import LIKELY, risk_findings, suspect_findings
+from torchsoft.sysid.suspect_findings import LIKELY, risk_findings, suspect_findings
+from torchsoft.sysid.suspect_findings import test_findings as findings_of_tests
 
 E, K_N, MU_S, MU_K = "materials.gel.E", "laws.dry.K_n", "contact.mu_s", "contact.mu_k"
 TRUTH = {E: 0.85e6, K_N: 1.3e5}
@@ -341,7 +341,7 @@ def test_constants_of_the_computation_widen_intervals_and_are_named():
     np.testing.assert_allclose(checked.covariance(), np.linalg.inv(precision)[:2, :2], rtol=1e-9)
     wide = np.sqrt(np.diag(np.linalg.inv(precision))[0] / np.linalg.inv(J.T @ J)[0, 0])
     assert checked.wider[E] == pytest.approx(wide)
-    effort, moves, unknown = map(str, suspects.test_findings(checked))
+    effort, moves, unknown = map(str, findings_of_tests(checked))
     assert "so b, c were not refitted" in effort
     assert re.search(rf"{E} depends on .* pads have 10 .* by 1\.5 .* {wide:.2g} times as", moves)
     assert "could not be checked (pads have 10 elements): a run failed" in unknown

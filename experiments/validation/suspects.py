@@ -46,7 +46,7 @@ from torchsoft.sysid import IdentificationResult, Recording, Unreachable, explai
 from torchsoft.sysid.alternatives import delayed
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import forget
-from torchsoft.sysid.suspects import LIKELY
+from torchsoft.sysid.suspect_findings import LIKELY
 
 SIX = (f"{LAW}.K_n", f"{LAW}.K_t", MU_S, MU_K, f"{RUBBER}.E", f"{RUBBER}.tau")
 """Unknowns; the laboratory knows the others."""

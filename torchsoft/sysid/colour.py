@@ -9,11 +9,11 @@ from scipy.sparse.linalg import spsolve_triangular
 
 from torchsoft.sysid.fit import Fit, chord
 from torchsoft.sysid.noise import Autoregression, NoiseFit, fit_noise
-from torchsoft.sysid.plan import iterated
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import FAINT, LEVEL, Part, parts
 from torchsoft.sysid.sentences import Finding
+from torchsoft.sysid.stages import iterated
 
 ROUNDS = 2
 """Most estimates of the noise: from the residuals of the fit, and from those of the fit with that

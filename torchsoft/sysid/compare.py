@@ -38,7 +38,6 @@ from torchsoft.sysid.colour import allow_for_colour
 from torchsoft.sysid.fit import Fit, Stage, Unreachable
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
-from torchsoft.sysid.plan import FINER, continued, default_plan, run_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.residual_tests import (
@@ -50,6 +49,7 @@ from torchsoft.sysid.residual_tests import (
 )
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
+from torchsoft.sysid.stages import FINER, continued, default_plan, run_plan
 
 EVIDENCE = 5.0
 """Logarithm of Bayes' factor from which evidence is very strong (Kass and Raftery 1995)."""

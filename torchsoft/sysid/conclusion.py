@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.solve.progress import SimulationFailed
+from torchsoft.sysid.assumption_checks import Checked
 from torchsoft.sysid.colour import colour_findings, rewhitened, spread, undeclared_colour
 from torchsoft.sysid.estimate import ChannelResiduals, Estimate, nrmse
 from torchsoft.sysid.fit import Fit, covariance, fisher
 from torchsoft.sysid.noise import NoiseFit
-from torchsoft.sysid.plan import FINER, JACOBIAN_ERROR, STEP_BIAS
 from torchsoft.sysid.prediction import run_doubts
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array
@@ -26,9 +26,9 @@ from torchsoft.sysid.residual_tests import (
     residual_findings,
     systematic,
 )
-from torchsoft.sysid.sensitivity import Checked
 from torchsoft.sysid.sentences import Finding
-from torchsoft.sysid.suspects import risk_findings, suspect_findings, test_findings
+from torchsoft.sysid.stages import FINER, JACOBIAN_ERROR, STEP_BIAS
+from torchsoft.sysid.suspect_findings import risk_findings, suspect_findings, test_findings
 
 # Residuals
 

@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from torchsoft.plan.knots import Bounds
+from torchsoft.sysid.design_criterion import RTOL, Optimality
 from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.initial_state import LEAD, SETTLE
-from torchsoft.sysid.planner import RTOL, Optimality
 from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import LISTED, SEED, Table, from_toml, line
 

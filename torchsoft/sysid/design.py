@@ -24,9 +24,16 @@ from torchsoft.rigs.fields import at_field
 from torchsoft.solve.gradients import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.configuration import Config, Entry, Rest, StartTable
+from torchsoft.sysid.design_criterion import (
+    PRICE,
+    RTOL,
+    DesignEvaluation,
+    DesignEvaluator,
+    Optimality,
+    Range,
+)
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.measured import vocabulary
-from torchsoft.sysid.planner import PRICE, RTOL, DesignEvaluation, Optimality, Planner, Range
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.sentences import Finding
@@ -87,12 +94,12 @@ class Search(NamedTuple):
     failed: int
 
 
-def search(planner: Planner, iterations: int, seed: int, progress: bool) -> Search:
+def search(evaluator: DesignEvaluator, iterations: int, seed: int, progress: bool) -> Search:
     """Move the knots from the motion given, and keep the best evaluated motion, also on Ctrl-C.
     Raises `SimulationFailed` where the motion given cannot be run."""
-    moves, rng, rate = planner.moves, np.random.default_rng(seed), RATE
+    moves, rng, rate = evaluator.moves, np.random.default_rng(seed), RATE
     adam, z = ProjectedAdam(moves.start, moves.nearest, MEMORY), moves.start
-    first = best = planner.evaluate(z)
+    first = best = evaluator.evaluate(z)
     history, done, failed, in_a_row = [least := Visit.of(best, 0)], 0, 0, 0
     with (
         suppress(KeyboardInterrupt),
@@ -101,7 +108,7 @@ def search(planner: Planner, iterations: int, seed: int, progress: bool) -> Sear
         while done < iterations:
             try:
                 shifted = moves.nearest(adam.z + SMOOTHING * rng.standard_normal(moves.n))
-                slopes = planner.slopes(shifted, planner.evaluate(shifted))
+                slopes = evaluator.slopes(shifted, evaluator.evaluate(shifted))
             except (SimulationFailed, GradientFailed):
                 failed, in_a_row = failed + 1, in_a_row + 1
                 if in_a_row >= FAILURES:
@@ -114,7 +121,7 @@ def search(planner: Planner, iterations: int, seed: int, progress: bool) -> Sear
             adam.step(np.clip(slopes, -most, most), rate * warm * cool)
             if done % LOOK == 0 or done == iterations:
                 with suppress(SimulationFailed):
-                    seen = planner.evaluate(adam.z)
+                    seen = evaluator.evaluate(adam.z)
                     history.append(visit := Visit.of(seen, done))
                     if visit.score < least.score:
                         least, best, z = visit, seen, adam.z
@@ -185,10 +192,10 @@ def design(
 
     Of the plan's samples only the times count; the other recordings and the priors contribute their
     information. Faults of sensors are nuisances, which the criterion marginalises. Beside the
-    covariance it counts errors of a fit from finite steps and nonlinear samples (`Planner.errors`),
-    at the nominal values. `criterion` is "D" (the volume of the errors) or "A" (their mean square).
-    `bounds` holds the travel, speed and free knots of signals of the reference, `limits`
-    the ranges (low, high) [unit] of channels of the run, such as forces.
+    covariance it counts errors of a fit from finite steps and nonlinear samples
+    (`DesignEvaluator.errors`), at the nominal values. `criterion` is "D" (the volume of the errors)
+    or "A" (their mean square). `bounds` holds the travel, speed and free knots of signals of the
+    reference, `limits` the ranges (low, high) [unit] of channels of the run, such as forces.
 
     The search starts with the plan's own motion. Each of the `iterations` takes a run with
     sensitivities and 2 n with the adjoint, of relative tolerance `rtol`. A motion that cannot be
@@ -205,15 +212,15 @@ def design(
         raise ValueError("`bounds` names no signal whose knots may move")
     recording, started = problem.recordings[problem.names.index(plan)], clock.perf_counter()
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
-    planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
+    evaluator = DesignEvaluator(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
     try:
-        found = search(planner, iterations, seed, progress)
+        found = search(evaluator, iterations, seed, progress)
     except SimulationFailed as failure:
         raise ValueError(
             f"the motion given cannot be run, so that nothing can begin with it: {failure}"
         ) from None
     return Design(
-        recording=planner.made(found.z, found.best),
+        recording=evaluator.made(found.z, found.best),
         before=found.first.deviations,
         after=found.best.deviations,
         history=tuple(found.history),
@@ -223,11 +230,11 @@ def design(
             "torchsoft": version("torchsoft"),
             "criterion": criterion,
             "bounds": {name: one.model_dump() for name, one in bounds.items()},
-            "limits": planner.limits,
+            "limits": evaluator.limits,
             "iterations": found.iterations,
             "rtol": rtol,
             "seed": seed,
-            **planner.cost,
+            **evaluator.cost,
             "wall_s": clock.perf_counter() - started,
         },
     )
@@ -416,9 +423,11 @@ def rank(
             Problem([*recorded, one], sensors, unknowns),
             Moves(one.rig.reference, {}, 0.0),
         )
-        planner = Planner(problem, one.name, moves, limits or {}, criterion, names, rtol, workers)
+        evaluator = DesignEvaluator(
+            problem, one.name, moves, limits or {}, criterion, names, rtol, workers
+        )
         try:
-            seen = planner.evaluate(np.zeros(0))
+            seen = evaluator.evaluate(np.zeros(0))
         except SimulationFailed as failure:
             rated.append(Rated(one.name, failure=str(failure)))
         else:

@@ -15,6 +15,7 @@ from pydantic import Field
 from tqdm import tqdm
 
 from torchsoft.parallel import single_threaded
+from torchsoft.sysid.assumption_checks import Checked, check_assumptions
 from torchsoft.sysid.colour import allow_for_colour
 from torchsoft.sysid.conclusion import (
     ResidualCheck,
@@ -29,14 +30,13 @@ from torchsoft.sysid.conclusion import (
 )
 from torchsoft.sysid.estimate import estimates, residual_channels
 from torchsoft.sysid.fit import FAR_OFF, Fit, Loss, Stage, Unreachable
-from torchsoft.sysid.plan import FINER, default_plan, refine_steps, run_plan, shown
 from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.result import IdentificationResult, recorded_rigs, seen_together
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.search import coarsened
-from torchsoft.sysid.sensitivity import Checked, check_assumptions
 from torchsoft.sysid.sentences import SEVERITIES, Finding
+from torchsoft.sysid.stages import FINER, default_plan, refine_steps, run_plan, shown
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
@@ -49,7 +49,7 @@ PACKAGES = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
 Assumed = Literal["checked", "explained", "trusted"]
 """Whether assumptions get score tests, score tests and refits that look for a cause, or no test."""
 
-EFFORT = 3.0
+EFFORT = 2.0
 """Work of refits, over that of the fit itself, after which `explain` starts no other."""
 
 

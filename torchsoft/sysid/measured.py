@@ -39,10 +39,10 @@ from torchsoft.sysid.configuration import (
 from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX, Standing
-from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.prechecks import channel as channel_of
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.stages import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.unknowns import Sensor, by_channel
 from torchsoft.tables import line, shown
 

@@ -20,12 +20,12 @@ from torchsoft.physics.names import effort_channel
 from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import PREFIX
-from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prediction import Prediction, Readout
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sentences import Finding
+from torchsoft.sysid.stages import LOOSE
 from torchsoft.sysid.unknowns import Sensor
 from torchsoft.tables import shown
 

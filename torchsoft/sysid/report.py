@@ -24,7 +24,7 @@ from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Reading
 from torchsoft.sysid.result import IdentificationResult
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.suspects import CONTRADICTED, MOVED
+from torchsoft.sysid.suspect_findings import CONTRADICTED, MOVED
 from torchsoft.tables import plain
 
 PAGES = Environment(

@@ -5,8 +5,9 @@
 2. Successive halving: every suspect of a bracket gets one step; then the best third goes on with
    three times as many evaluations, until a few finalists are left. The likeliest by its score test
    is a finalist, too, and so are those whose score tests explain as much as the best fit.
-3. Finalists are fitted until they converge, on fine steps. The search ends after a bracket in which
-   one explains the misfit, and when refits took all of the effort.
+3. Finalists are fitted until they converge, on fine steps, the best one first. The search ends
+   after a bracket in which one explains the misfit, or when refits took all of the effort and none
+   does.
 """
 
 import warnings
@@ -22,11 +23,11 @@ from torchsoft.display import hidden
 from torchsoft.sysid.assumption_tests import EVIDENT, AssumptionTest, Linearised
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect
 from torchsoft.sysid.fit import Fit, Stage, Unreachable, gauss_newton
-from torchsoft.sysid.plan import LOOSE, USUAL, continued, refine_steps, scanned
 from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import EARLY
+from torchsoft.sysid.stages import LOOSE, USUAL, continued, refine_steps, scanned
 from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
@@ -210,7 +211,8 @@ def search(
     of a fit and the score `tests` of the suspects.
 
     Yields the test of every suspect that was tried: of finalists that of the refit, and the refit.
-    It ends when refits took `effort` times the work of the fit.
+    It ends when refits took `effort` times the work of the fit, unless one explains the misfit:
+    then its rivals are completed.
     """
     queue = sorted(some, key=lambda one: (one.costly, -tests[one.name].gain))  # 1.
     most, finest = end.runner.work * (1.0 + effort), end.check.rtol
@@ -238,6 +240,8 @@ def search(
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
                 explained = explained or bool(test.suspected and test.passed)
+                if not explained and end.runner.work >= most:
+                    return
             if explained:
                 return
 

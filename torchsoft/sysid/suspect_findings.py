@@ -4,10 +4,10 @@ matter, and errors that the data would not show."""
 from collections.abc import Sequence
 from typing import Any
 
+from torchsoft.sysid.assumption_checks import Checked
 from torchsoft.sysid.assumption_tests import AssumptionTest
 from torchsoft.sysid.assumptions import AMOUNTS
 from torchsoft.sysid.search import RIVAL
-from torchsoft.sysid.sensitivity import Checked
 from torchsoft.sysid.sentences import TESTS, Finding, Severity
 
 LIKELY = 0.01

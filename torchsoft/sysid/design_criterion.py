@@ -137,7 +137,7 @@ class DesignEvaluation(NamedTuple):
     run: Prediction
 
 
-class Planner:
+class DesignEvaluator:
     """The criterion of motions of one recording of a problem at the nominal values of its unknowns,
     and its gradient by their knots. Raises `ValueError` where the other recordings cannot be
     run."""
@@ -203,7 +203,7 @@ class Planner:
         return p.gather(x, [job], [run]), run
 
     def evaluate(self, z: Array, steps: Frozen | None = None) -> DesignEvaluation:
-        """Evaluate the motion z, with the planner's tolerance or with `steps`; on frozen steps
+        """Evaluate the motion z, with the evaluator's tolerance or with `steps`; on frozen steps
         without the errors. Raises `SimulationFailed`."""
         at, run = self.run(z, self.x, self.rtol if steps is None else steps, self.free)
         C, T = np.zeros((len(self.x), len(self.x))), self.T
