@@ -27,7 +27,7 @@ from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import EARLY
-from torchsoft.sysid.stages import LOOSE, USUAL, continued, refine_steps, scanned
+from torchsoft.sysid.stages import LOOSE, USUAL, continued, continued_on, refine_steps, scanned
 from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
@@ -41,13 +41,20 @@ are small beside the misfit."""
 FAINT = 0.05
 """Part of the misfit above the noise that a suspect explains by its score test to be in the first
 bracket, however large that is: far from the data score tests order suspects wrongly, and causes had
-0.16 and more."""
+0.16 and more. A refit that leaves as little, and what chance
+leaves, may explain the misfit."""
 
 KEPT = 3
 """One in so many suspects goes on after a round, with so many times as many evaluations."""
 
 COMPLETE, ROUGH = 20, 1e-3
 """Most evaluations of a finalist, and its relative tolerance."""
+
+TIGHTENINGS = 2
+"""Most times that a finalist goes on with a tenth of its tolerance."""
+
+UNLIKELY = 3.0
+"""Standard deviations of a sum of squares that count as chance."""
 
 COMPARABLE = 2 * EVIDENT
 """A finalist that leaves more than this beyond the best one is stopped: `EVIDENT`, and as much for
@@ -301,9 +308,9 @@ def best_of(fits: Mapping[Suspect, Fit], linear: Linearised) -> list[Suspect]:
     explains the misfit."""
     ranked = sorted(fits, key=lambda one: fits[one].square)
     kept = ranked[: max(len(ranked) // KEPT, FINALISTS)]
-    if not seems_to_explain(fits[kept[0]], linear):
-        return kept
     gains = {one: linear.square - fits[one].square for one in kept}
+    if gains[kept[0]] < max(NEARLY * (linear.square - linear.dof), EVIDENT):
+        return kept
     return [one for one in kept if gains[one] >= RIVAL * gains[kept[0]]]
 
 
@@ -349,20 +356,22 @@ def on_loose_steps(end: Fit) -> Fit:
 
 def completed(fit: Fit, finest: float, most: float, linear: Linearised) -> Fit:
     """The fit, continued until it converges, with ratios at a bound scanned over their whole range;
-    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares, or of a
-    tenth of it where they matter. One that seems to explain the misfit may take another tenth."""
+    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares. Where
+    it may explain the misfit, finer steps must not matter."""
     c = fit.problem.coordinates
     stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
     stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
     end = continued(fit, stage) or fit
     if end.square > most:
         return end._replace(converged=False)
-    if end.loss != "linear":
-        return refine_steps(end.by(finest), 0)
-    end = refine_steps(end.by(finest), 1)
-    return refine_steps(end, 1) if seems_to_explain(end, linear) else end
+    end = end.by(finest)
+    fresh = end.residuals(steps=finest)
+    end = end if fresh.failed else continued_on(end, fresh, "steps chosen anew")
+    tighten = end.loss == "linear" and may_explain(end, linear)
+    return refine_steps(end, TIGHTENINGS if tighten else 0)
 
 
-def seems_to_explain(fit: Fit, linear: Linearised) -> bool:
-    """Whether a fit explains nearly all of the misfit above the noise."""
-    return linear.square - fit.square >= max(NEARLY * (linear.square - linear.dof), EVIDENT)
+def may_explain(fit: Fit, linear: Linearised) -> bool:
+    """Whether a fit leaves little of the misfit above the noise, and what chance leaves."""
+    chance = UNLIKELY * (2 * linear.dof) ** 0.5
+    return fit.square - linear.dof <= FAINT * (linear.square - linear.dof) + chance
