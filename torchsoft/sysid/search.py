@@ -41,8 +41,7 @@ are small beside the misfit."""
 FAINT = 0.05
 """Part of the misfit above the noise that a suspect explains by its score test to be in the first
 bracket, however large that is: far from the data score tests order suspects wrongly, and causes had
-0.16 and more. A refit that leaves as little, and what chance
-leaves, may explain the misfit."""
+0.16 and more. A refit that leaves as little, besides chance, may explain the misfit."""
 
 KEPT = 3
 """One in so many suspects goes on after a round, with so many times as many evaluations."""
