@@ -14,6 +14,7 @@ from torchsoft import (
     Rig,
     SamplesFailed,
     SimulationFailed,
+    Taxels,
     Trajectory,
     hold,
     simulate,
@@ -34,6 +35,7 @@ WRT = ["contact.K_n", "pad.E"]
 @pytest.fixture
 def start():
     model = coarse()
+    model.taxels["skin"] = Taxels("L", 3e-3, count=40)
     y0 = torch.stack([grasped(model, (0.02, 0.0))] * 3)
     y0[1, model.layout.slices["velocity", "disc"]] = f64(-0.01, 0.0, 0.5)
     return model, y0
@@ -61,16 +63,15 @@ def test_every_run_is_the_one_it_would_be_alone(start, threads):
     assert batch["theta"].shape == batch.mask.shape == (3, 5)
     assert batch.mask.all()
     weights = torch.linspace(1, 2, 15, dtype=torch.float64).reshape(3, 5)
-    by_rows, by_starts, by_E = torch.autograd.grad(
-        (weights * batch["theta"]).sum(), [rows, starts, E]
-    )
+    felt = lambda run: run["theta"] + run["skin.normal.20"] + run["bracket_moment"]
+    by_rows, by_starts, by_E = torch.autograd.grad((weights * felt(batch)).sum(), [rows, starts, E])
     shared = torch.zeros((), dtype=torch.float64)
     for i in range(3):
         one = y0[i].clone().requires_grad_()
         run = alone(model, i, one, gradient="discrete")
         assert torch.equal(batch.y[i], run.y)
         wanted = [model.parameter("contact.K_n"), one, E]
-        by_K, by_start, more = torch.autograd.grad((weights[i] * run["theta"]).sum(), wanted)
+        by_K, by_start, more = torch.autograd.grad((weights[i] * felt(run)).sum(), wanted)
         assert torch.allclose(by_rows[i], by_K, rtol=1e-12, atol=0)
         assert torch.allclose(by_starts[i], by_start, rtol=1e-12, atol=1e-30)
         shared += more

@@ -304,11 +304,7 @@ SLOW = {
         shape=EGG(), under=OGDEN(), material=NetworkEnergy(), points=2,
         tip=CurvedPadMesh(30e-3, 6e-3, 15, 2, radius=40e-3)),
 }  # fmt: skip
-RIGS = FAST | SLOW | {
-    "circle": grip,
-    "enclosed pad": lambda: grip(tip=PadMesh(40e-3, 4.59e-3, 20, 2, bonded_sides=True)),
-}  # fmt: skip
-"""With two plain ones, for other tests."""
+RIGS = FAST | SLOW
 
 
 @pytest.fixture(

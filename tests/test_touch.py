@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import RUBBER, coarse, dry, grasped, times
+from rig_tester import assert_gradients_exact
 from scipy.integrate import quad
 from scipy.stats import norm
 from torch import Tensor
@@ -22,12 +23,9 @@ from torchsoft import (
     PadMesh,
     Rig,
     RigFile,
-    SmoothSlip,
-    SoftContact,
     Taxels,
     Trajectory,
     simulate,
-    simulate_batch,
 )
 from torchsoft.physics.channels import LIGHT
 from torchsoft.sysid import Problem, Sensor, Unknown, record
@@ -47,27 +45,20 @@ def run(**options: Any) -> Trajectory:
     return simulate(model, times(0.1, 3), y0=y0, **options)
 
 
-@pytest.mark.filterwarnings("ignore:the derivatives by .* were not checked")  # without effect
 def test_gradients_of_every_channel_are_the_differences():
     """Taxels and centres too, of a light disc that touches down between two outputs, rolls and
     slips."""
-    mesh, rubber = PadMesh(60e-3, 4.59e-3, 60, 3), KelvinVoigt(0.7e6, 0.45, 1100.0, 0.01, 10e-3)
-    law = SoftContact(1.2e5, 441.7, 1.1e5, 430.0, friction=SmoothSlip(0.5, 0.4, 5e-2))
+    mesh, rubber = PadMesh(60e-3, 4.59e-3, 60, 3), KelvinVoigt(**RUBBER, tau=0.01)
     rig = Rig(
         bodies={"disc": Body(0.05, Circle(19.37e-3))},
         pads={"table": Pad(mesh, rubber, origin=(-30e-3, 0.0))},
-        contacts={"table": Contact("table", "disc", law)},
+        contacts={"table": Contact("table", "disc", dry())},
         taxels={"skin": Taxels("table", 2e-3, centres=(-2e-3, 0.0, 1e-3), spread=5e-4)},
     )
-    y0 = torch.zeros(rig.layout.size, dtype=torch.float64)
-    y0[rig.layout.slices["pose", "disc"]] = f64(2e-4, mesh.height + 19.37e-3 + 1e-4, 0.0)
-    y0[rig.layout.slices["velocity", "disc"]] = f64(0.02, -0.04, 3.0)
-    checked = check_gradients(
-        rig, times(0.03, 14), y0, rtol=1e-5, bound=2e-6, dy0=1e-3 * y0.abs(), each=False,
-        step_error=False, centres=True,
-    )  # fmt: skip
-    assert sum(one.difference is not None for one in checked.derivatives) == 2
-    touching = checked.run.force["table"][..., 0].detach().sum(-1) > 0
+    place = {"x": 2e-4, "y": mesh.height + 19.37e-3 + 1e-4}
+    y0 = rig.state(disc=place | {"v_x": 0.02, "v_y": -0.04, "omega": 3.0}).detach()
+    made = assert_gradients_exact((rig, y0), times(0.03, 14), rtol=1e-5, centres=True)
+    touching = made.force["table"][..., 0].detach().sum(-1) > 0
     assert not bool(touching[0])
     assert bool(touching[5:].all())
 
@@ -128,29 +119,10 @@ def test_taxels_that_cannot_be_are_rejected(make, message):
         make()
 
 
-def test_gradients_of_forces_in_a_batch_and_of_stored_energies():
-    """A batch's are those of its runs, and those of energies the differences."""
+def test_gradients_of_stored_energies_are_the_differences():
     model, y0 = pressed()
-    values, t = f64(0.6e6, 0.8e6).requires_grad_(), times(0.05, 6)
-    how = {"y0": y0, "rtol": 1e-4, "tolerance": 1e-10, "gradient": "discrete"}
-    felt = lambda run: run["skin.normal.20"][..., -1] + run["bracket_moment"][..., 2]
-    batch = simulate_batch(model, t, parameters={"pad.E": values}, threads=2, **how)
-    (slopes,) = torch.autograd.grad(felt(batch).sum(), values)
-    E = model.parameter("pad.E")
-    for value, slope in zip(values.tolist(), slopes):
-        with torch.no_grad():
-            E.fill_(value)
-        made = simulate(model, t, **how)
-        (alone,) = torch.autograd.grad(felt(made), E, retain_graph=True)
-        assert float(slope) == pytest.approx(float(alone), rel=1e-9)
-    (slope,) = torch.autograd.grad(made.energy["strain_L"].sum(), E)
-    ends = []
-    for h in (1.0, -2.0):
-        with torch.no_grad():
-            E.add_(h)
-        again = simulate(model, t, y0=y0, tolerance=1e-10, knots=made.knots)
-        ends.append(float(again.energy["strain_L"].sum()))
-    assert float(slope) == pytest.approx(0.5 * (ends[0] - ends[1]), rel=1e-5)
+    stored = lambda run: run.energy["strain_L"].sum()
+    check_gradients(model, times(0.05, 6), y0, wrt=["pad.E"], of=stored, step_error=False)
 
 
 def test_taxels_are_sensors_of_a_fit_and_columns_of_its_recordings():
