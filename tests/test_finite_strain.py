@@ -5,27 +5,23 @@ import ctypes
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import RUBBER, f64, paper, still
+from conftest import RUBBER, f64, paper
 from test_material import ARMS, ENERGIES, REST, energy
 from torch import Tensor
 
 from torchsoft import (
     Body,
     Circle,
-    Contact,
     Hyperelastic,
     KelvinVoigt,
     NeoHookean,
     Pad,
     PadMesh,
     Rig,
-    SmoothSlip,
-    SoftContact,
     Trajectory,
     Yeoh,
     simulate,
@@ -41,7 +37,7 @@ from torchsoft.testing import CheckFailed, check_energy
 
 SKEWED = np.array([[[0.0, 0.0], [1.0, 0.02], [1.05, 1.0], [0.03, 0.9]]]) * 1e-3
 CONSTANTS = torch.from_numpy(element_constants(QUADRILATERAL, SKEWED)[0])
-KINDS = pytest.mark.parametrize("kind", ENERGIES)
+
 EVERY = pytest.mark.parametrize(
     "material",
     [energy(kind, **arms) for kind in ENERGIES for arms in ({}, ARMS)],
@@ -83,39 +79,27 @@ def forces(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
 )
 def test_compiled_elements_have_the_forces_and_derivatives_of_their_energies(kind):
     """Several at once, of which one is at rest: a product whose first factor vanishes has a
-    derivative."""
+    derivative. `test_every_rig` has derivatives by parameters."""
     material, n = energy(kind), 8
-    own = Factors(factors(material))
-    function, parameters = as_law(element, {"material": material, "factors": own})
+    parts = {"material": material, "factors": Factors(factors(material))}
+    function, parameters = as_law(element, parts)
     x = [moved(material, lane * 3e-5, lane * 3e-4, lane) for lane in range(LANES)]
     law = compile_law(
         function, x[-1], parameters, linear=n, differentiated=2 * n, conjugates=n, lanes=LANES
     )
     p = np.concatenate([value.detach().numpy().ravel() for value in parameters.values()])
-    w = np.random.default_rng(0).normal(size=(n, LANES))
-    out, J, bar = np.zeros((n + 1, LANES)), np.zeros((n, 2 * n, LANES)), np.zeros(len(p))
+    out, J = np.zeros((n + 1, LANES)), np.zeros((n, 2 * n, LANES))
+    call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(law.linearise)
     given = torch.stack(x, -1).numpy()
-    for address, arrays in (
-        (law.linearise, (given, p, out, J)),
-        (law.pull, (given, p, w, bar)),
-    ):
-        call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 4)(address)
-        call(*(one.ctypes.data for one in arrays))
-    leaves = {name: p.detach().clone().requires_grad_() for name, p in parameters.items()}
-    of = lambda x: forces(lambda x: function(x, leaves), x)
-    weighted = torch.zeros(())
+    call(*(one.ctypes.data for one in (given, p, out, J)))
+    of = lambda x: forces(lambda x: potentials(material, x), x)
     for lane in range(LANES):
-        expected = of(x[lane])
-        weighted = weighted + torch.from_numpy(w[:, lane]) @ expected
-        f = expected.detach().numpy()
+        f = of(x[lane]).detach().numpy()
         assert out[:n, lane] == pytest.approx(f, rel=1e-9, abs=1e-12 * np.abs(f).max())
         power = 2 * float(potentials(material, x[lane])[1].detach())
         assert out[n, lane] == pytest.approx(power, rel=1e-9)
         slopes = torch.autograd.functional.jacobian(of, x[lane])[:, : 2 * n].numpy()
         assert J[..., lane] == pytest.approx(slopes, rel=1e-9, abs=1e-9 * np.abs(slopes).max())
-    bars = torch.autograd.grad(weighted, list(leaves.values()), materialize_grads=True)
-    bars = torch.cat([one.flatten() for one in bars]).numpy()
-    assert bar == pytest.approx(bars, rel=1e-9, abs=1e-11 * np.abs(bars).max())
 
 
 @EVERY
@@ -136,6 +120,15 @@ def test_small_strains_are_those_of_the_linear_chain(material):
     expected = torch.cat((on_nodes, *on_branches)).numpy()
     found = forces(lambda x: potentials(material, x), x).detach().numpy()
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max())
+
+
+@EVERY
+def test_the_linear_pad_has_its_chain(material):
+    pad = Pad(PadMesh(4e-3, 3e-3, 4, 3), material)
+    linear = Pad(pad.mesh, KelvinVoigt(E=material.E.item(), **REST, tau=0.01))
+    assert torch.allclose(pad.condensed().compliance(), linear.compliance(), rtol=1e-12)
+    for found, expected in zip(material.linear().chain(), material.chain(), strict=True):
+        assert torch.allclose(found, expected, rtol=1e-12)
 
 
 @EVERY
@@ -198,7 +191,7 @@ def test_forces_are_those_of_another_program(monkeypatch):
     assert 1e-4 < abs(with_it / without - 1) < 2e-3
 
 
-@KINDS
+@pytest.mark.parametrize("kind", ENERGIES)
 def test_a_step_of_strain_is_carried_by_the_branches_too_at_first_and_not_at_last(kind):
     """By 1 + m times the relaxed stress, exactly, at any strain."""
     material, u = energy(kind, **ARMS), moved(energy(kind), 1e-4, 0.0, 3)[:8]
@@ -324,24 +317,10 @@ def test_the_ratio_of_times_counts_for_branches_and_inertia_allows_none():
         Pad(mesh, rubber, inertial=True).check_chain("P")
 
 
-def pressed(nu: float, finer: int) -> float:
-    """Force [N] of the lower pad on the paper's disc, held 0.4 mm deep in it."""
-    rubber = {"kind": "neo_hookean", "E": 7.5e5, "nu": nu, "tau": 0.01, "depth": 0.044}
-    mesh = {"elements_x": 15 * finer, "elements_y": 2 * finer, "length": 0.03}
-    changes = {f"pads.L.{name}": value for name, value in mesh.items()}
-    changes |= {"materials.rubber": rubber, "laws.steel_on_rubber.K_n": 4e6}
-    changes |= {"pads.L.origin": [0.045, 0.0]}
-    rig = still(changes)
-    y = rig.state(disc={"x": 60e-3, "y": 23.56e-3}, bracket={"x": 60e-3, "y": 1.0})
-    return float(rig.evaluate(0.0, rig.unpack(y)).interfaces["L"].law.force[:, 0].detach().sum())
-
-
-def test_nearly_incompressible_pads_do_not_lock():
-    assert 0.94 < pressed(0.499, 1) / pressed(0.499, 2) < 1.0
-
-
-RUBBERY = {"kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044}
-RELAXING = RUBBERY | {"moduli": [4.5e5], "times": [0.05]}
+RELAXING = {
+    "kind": "neo_hookean", "E": 7.5e5, "nu": 0.45, "tau": 0.01, "depth": 0.044,
+    "moduli": [4.5e5], "times": [0.05],
+}  # fmt: skip
 COARSE = {
     "pad.elements_x": 30, "pad.elements_y": 2, "materials.rubber": RELAXING,
     "outputs": {"duration": 0.2, "interval": 5e-3, "snapshots": [0.0], "figures": False},
@@ -354,9 +333,7 @@ def run():
 
 
 def test_the_ledger_closes_at_the_tolerance(run):
-    loose = paper(COARSE).run(rtol=1e-3)
     assert run.energy_residual_rel < 2e-5
-    assert run.energy_residual_rel < 0.2 * loose.energy_residual_rel
     assert float(run.dissipated["pad_L"].diff().min()) >= 0
     assert float(run.energy["strain_L"][-1].detach()) > 1e-3
 
@@ -385,34 +362,3 @@ def test_a_run_is_kept_in_files_and_shown(run, tmp_path):
     assert pad.stress(pad.displacement(u)).min() < -5e4
     assert 0.05 < pad.largest_strain(u) < 0.5
     assert loaded.to_vtk(tmp_path / "run.pvd", [0.2])
-
-
-def let_go(material: Any, force: Tensor, times: Tensor) -> Tensor:
-    """Displacements (times, surface, 2) of a pad that was in equilibrium under forces on its
-    surface and is let go, on given steps."""
-    pad = Pad(PadMesh(12e-3, 4.59e-3, 12, 3), material)
-    away = Body(0.4, Circle(5e-3), x=0.0, y=1.0, theta=0.0, weighted=False)
-    law = SoftContact(1.2e5, 441.7, 1.1e5, 430.0, friction=SmoothSlip(0.5, 0.4, 5e-2))
-    contact = Contact("floor", "disc", law, may_leave=True)
-    rig = Rig(bodies={"disc": away}, pads={"floor": pad}, contacts={"touch": contact})
-    part = force.expand(pad.branches, -1, -1)
-    if pad.nodal:
-        linear, mesh = pad.condensed(), pad.mesh
-        u = (linear.compliance() @ force.flatten()).unflatten(0, (-1, 2)).detach().numpy()
-        whole = linear.displacement(u)[mesh.free]
-        part = torch.from_numpy(np.tile(whole, pad.fields))
-    still = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
-    y0 = rig.pack(still._replace(pads={"floor": part}))
-    run = simulate(rig, times, y0=y0, step=5e-3, tolerance=1e-10)
-    return pad.at_points(run.displacement["floor"]).detach()
-
-
-def test_a_little_motion_is_that_of_the_linear_chain():
-    """A pad that creeps back, on the same steps as a linear one with the same chain."""
-    rubber = energy("neo_hookean", moduli=[4.5e5], times=[0.05])
-    force = 1e-5 * torch.randn(13, 2, generator=torch.Generator().manual_seed(0)).double()
-    times = torch.linspace(0, 0.1, 5, dtype=torch.float64)
-    finite, linear = (let_go(one, force, times) for one in (rubber, rubber.linear()))
-    scale = float(linear[0].abs().max())
-    assert float((finite - linear).abs().max()) < 1e-6 * scale
-    assert 0.05 < float(linear[-1].abs().max()) / scale < 0.9
