@@ -1,10 +1,10 @@
-"""The kernels' verbs as plain Python: banded solves and the block of a pad against dense algebra,
-the tangent and the adjoint of a stage against each other. And the speed of a run."""
+"""The tangent and the adjoint of a stage, as plain Python, against each other; the speed of a
+run."""
 
 import ctypes
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
@@ -17,7 +17,6 @@ from torchsoft.codegen import compile_law
 from torchsoft.solve.kernel import (
     adjoint,
     contacts,
-    linear,
     nodal,
     pads,
     sources,
@@ -65,85 +64,18 @@ def plain(monkeypatch):
             monkeypatch.setattr(module, f"call_{name}", called(*arrays), raising=False)
 
 
-class Stage(NamedTuple):
-    """The first stage of a step of a rig: its arrays, scratch and tapes."""
-
-    rig: Any
-    work: Any
-    tapes: Any
-    signals: Any
-    size: int
-
-
-def first_stage(name: str) -> Stage:
+@pytest.mark.parametrize("forces", [False, True])
+@pytest.mark.parametrize("name", RIGS)
+def test_the_adjoint_of_a_stage_is_its_tangent_transposed(name, forces):
+    """<bar, push(d)> = <pull(bar), d> for random directions of state and parameters, and for the
+    forces of a stage of no length."""
     rig, segments = RIGS[name](), list[Segment]()
     stepper, t = ImplicitStepper(rig, step=STEP), times(10 * STEP, 2)
     with torch.no_grad():
         [*stepper.integrate(random_state(rig, 3), t, segments, float("inf"))]
     rig, size = stepper.parameters.system, stepper.layout.size
     work = scratch("Work", rig, size, columns=2)
-    return Stage(rig, work, segments[-1].tapes, segments[-1].stages, size)
-
-
-@pytest.mark.parametrize(("n", "band"), [(1, 1), (7, 2), (40, 5)])
-def test_banded_solves_are_the_dense_ones(n, band):
-    distance = np.subtract.outer(np.arange(n), np.arange(n))
-    A = np.where(abs(distance) <= band, ANY.normal(size=(n, n)), 0.0) + 4 * band * np.eye(n)
-    factor = np.zeros((n, 2 * band + 1))
-    for i, j in zip(*np.nonzero(abs(distance) <= band)):
-        factor[i, j - i + band] = A[i, j]
-    b = ANY.normal(size=(n, 3))
-    factor, x, back = factor.ravel(), b.ravel().copy(), b[:, 0].copy()
-    linear.factor_banded(factor, n, band)
-    linear.solve_banded(factor, n, band, x, 3, 0)
-    linear.solve_transposed(factor, n, band, back)
-    assert x.reshape(n, 3) == pytest.approx(np.linalg.solve(A, b), rel=1e-10)
-    assert back == pytest.approx(np.linalg.solve(A.T, b[:, 0]), rel=1e-10)
-
-
-@pytest.mark.parametrize("name", RIGS)
-def test_the_block_of_a_pad_is_that_of_dense_algebra(name):
-    """A F = b + Hc dV with the points' own derivatives: A = 1 - N^T H_u N P, and elimination is
-    that of the whole system."""
-    rig, work, (tape, _), *_ = first_stage(name)
-    a, free = GAMMA * STEP, len(rig.body_coordinate)
-    contacts.restore(rig, work, tape, 1, a, False)
-    linear.put(tape.rate[1], work.rate)
-    for pad in range(len(rig.pad_base)):
-        Rv, r = np.zeros((free, free)), np.zeros((free, 1))
-        pads.assemble(rig, work, pad, tape.y[1], a, Rv)
-        n, at = 2 * work.counts[pad], rig.pad_point_start[pad]
-        active = work.active[at : at + work.actives[pad]]
-        assert n > 0
-        N, H = np.zeros((2 * len(active), n)), np.zeros((2 * len(active), 2 * len(active)))
-        for i, k in enumerate(active):
-            for j in range(2):
-                slot = work.slot[rig.point_node[k, j]]
-                N[2 * i : 2 * i + 2, 2 * slot : 2 * slot + 2] += rig.point_N[k, j] * np.eye(2)
-            H[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = work.H[at + i, :2, :2]
-        A = np.eye(n) - N.T @ H @ N @ work.P[:n, :n]
-        assert work.A[:n, :n] == pytest.approx(A, rel=1e-11, abs=1e-13)
-
-        columns = rig.pad_columns[pad]
-        Hc, Rf = work.Hc[:n, :columns].copy(), work.Rf[:columns, :n].copy()
-        b, own = ANY.normal(size=n), rig.pad_column[pad] >= 0
-        first, before = 2 * rig.pad_node_start[pad], Rv.copy()
-        work.X[first : first + n, 0] = b
-        contacts.eliminate(rig, work, pad, 1, r, Rv)
-        number = rig.pad_column[pad][own]
-        schur, load = np.zeros((free, free)), np.zeros(free)
-        schur[np.ix_(own, own)] = (Rf @ np.linalg.solve(A, Hc))[np.ix_(number, number)]
-        load[own] = (Rf @ np.linalg.solve(A, b))[number]
-        assert Rv - before == pytest.approx(schur, rel=1e-9, abs=1e-12 * abs(schur).max())
-        assert r[:, 0] == pytest.approx(load, rel=1e-9, abs=1e-12 * abs(load).max())
-
-
-@pytest.mark.parametrize("forces", [False, True])
-@pytest.mark.parametrize("name", RIGS)
-def test_the_adjoint_of_a_stage_is_its_tangent_transposed(name, forces):
-    """<bar, push(d)> = <pull(bar), d> for random directions of state and parameters, and for the
-    forces of a stage of no length."""
-    rig, work, tapes, signals, size = first_stage(name)
+    tapes, signals = segments[-1].tapes, segments[-1].stages
     tape, row, a = (tapes[1], 0, INSTANT) if forces else (tapes[0], 1, GAMMA * STEP)
     along, back = (scratch("Directions", rig, size, columns=n) for n in (2, 1))
     start = np.maximum(abs(tape.y[row]), 1e-6)[:, None] * ANY.normal(size=(size, 2))
