@@ -36,9 +36,6 @@ LAWS = {
 }
 
 
-EVERY = pytest.mark.parametrize(("contact", "most"), LAWS.values(), ids=LAWS)
-
-
 @torch.no_grad()
 def at(contact: SoftContact, *x: float, **more: Any) -> ContactState:
     """Of penetration, its rate, sliding speed and stretch."""
@@ -52,7 +49,7 @@ POINT = {
 }  # fmt: skip
 
 
-@EVERY
+@pytest.mark.parametrize(("contact", "most"), LAWS.values(), ids=LAWS)
 @settings(max_examples=30, derandomize=True, deadline=None)
 @given(**POINT)
 def test_power_is_balanced_friction_is_bounded_and_has_no_direction(
@@ -72,60 +69,14 @@ def test_power_is_balanced_friction_is_bounded_and_has_no_direction(
     assert F_N * g_dot + F_T * v_T == pytest.approx(
         by_g * g_dot + by_s * s_dot + sum(lost), abs=1e-9 * (scale + abs(by_g * g_dot))
     )
-    pull = float(contact.pull(f64(g)).detach())
+    pull, spring = (float(of(f64(g)).detach()) for of in (contact.pull, contact.spring))
     assert abs(F_T) <= most * (F_N + weight * pull) + 1e-9 * trial
-    assert F_N + weight * pull >= 0
+    assert 0 <= F_N + weight * pull <= 3 * weight * spring * (1 + 1e-12)  # continuous at touch-down
     if g <= 0:
         assert (F_N, F_T) == (0.0, 0.0)
     other = at(contact, g, g_dot, -v_T, -s, weight=weight)
     mirrored = [F_N, -F_T, -s_dot, -gamma_dot]
     assert [float(x) for x in other[:4]] == pytest.approx(mirrored, rel=1e-15, abs=1e-290)
-
-
-@EVERY
-def test_forces_are_continuous_at_touch_down(contact, most):
-    """They grow from zero with the springs, whatever the speed."""
-    for g in (1e-9, 1e-12):
-        got, apart = (at(contact, depth, 0.2, 0.3, 1e-5) for depth in (g, -g))
-        grown = 3 * float(contact.spring(f64(g)).detach()) + 0.02 * g / 1e-6
-        assert abs(float(got.F_N)) <= grown
-        assert abs(float(got.F_T)) <= most * grown + 1e-13
-        assert float(apart.F_N) == float(apart.F_T) == 0.0
-        assert abs(float(got.s_dot - apart.s_dot)) <= most * grown / (R / 2) + 1e-12
-
-
-SLIPS, STICKS = (5e-5, 1e-3, 0.5, 1e-6), (5e-5, 1e-3, 1e-4, 2e-6)
-
-
-@EVERY
-@pytest.mark.parametrize("x", [SLIPS, STICKS], ids=["slips", "sticks"])
-def test_a_stage_acts_through_the_states_at_its_end(contact, most, x):
-    """As the instantaneous law at s* + a h s' and z* + a h z'; derivatives with respect to motion
-    and parameters are those of differences."""
-    h = 6e-4
-    stage = at(contact, *x, stage=h)
-    states = {}
-    if stage.z_dot is not None:
-        (begin,) = (
-            p for name, p in contact.friction.named_parameters() if name in ("age_0", "theta_0")
-        )
-        states = {"z": begin.detach() + h * stage.z_dot}
-    now = at(contact, *x[:3], x[3] + h * float(stage.s_dot), **states)
-    for name in ("F_N", "F_T", "s_dot", "gamma_dot", "e"):
-        given, expected = (float(getattr(one, name)) for one in (now, stage))
-        assert given == pytest.approx(expected, rel=1e-7, abs=1e-13), name
-    given = {name: p.detach() for name, p in contact.named_parameters()}
-
-    def moved(by):
-        ways = 1 + by * torch.linspace(0.5, 1.5, 4 + len(given), dtype=torch.float64)
-        changed = {name: p * way for (name, p), way in zip(given.items(), ways[4:])}
-        arguments = tuple(f64(*x) * ways[:4])
-        out = torch.func.functional_call(contact, changed, arguments, {"stage": h})
-        return torch.stack(out[:4])
-
-    slope = torch.autograd.functional.jacobian(moved, f64(0.0)[0])
-    expected = (moved(f64(1e-5)[0]) - moved(f64(-1e-5)[0])) / 2e-5
-    assert slope.tolist() == pytest.approx(expected.tolist(), rel=1e-6, abs=1e-9)
 
 
 def quadratic() -> dict[str, float]:
@@ -213,11 +164,7 @@ def test_the_slip_rate_solves_the_elements_equation(made):
 
 def test_static_friction_at_the_start_is_that_of_the_age_there():
     friction = AgeingSlip(0.6, 0.5, ageing=0.02, t_0=1e-3, age_0=0.3)
-    strength = 0.6 + 0.02 * math.log(301.0)
-    assert friction.at_rest().item() == pytest.approx(strength, rel=1e-12)
-    for part, slips in ((1 - 1e-9, False), (1 + 1e-9, True)):
-        E = f64(part * strength)
-        assert bool(friction(E, f64(1.0), f64(100.0), f64(0.3)[:, None], 0.0)[0] > 0) == slips
+    assert friction.at_rest().item() == pytest.approx(0.6 + 0.02 * math.log(301.0), rel=1e-12)
 
 
 # bodies on slopes
@@ -300,14 +247,12 @@ def test_a_box_on_a_slope_does_as_coulomb_says(degrees, mass, friction):
     assert 2 * accelerates == pytest.approx(G * (math.sin(slope) - mu * math.cos(slope)), rel=0.04)
 
 
-SERIES = {"kind": "prony", "E": 0.15e6, "moduli": [0.15e6], "tau": [1.0], "nu": 0.45, "depth": 0.04}
-
-
 def test_friction_falls_no_faster_than_dashpots_of_law_and_pad_balance():
     """The instantaneous spring of a series has a dashpot of 0.1 ms only; a run in which points slip
     warns. A pad with a dashpot bounds nothing."""
     assert box(45).build().rig.contacts["ground"].law.friction.R_pad is None
-    built = box(45).override({"materials.gel": SERIES}).build()
+    series = {"kind": "prony", "E": 0.15e6, "moduli": [0.15e6], "tau": [1.0], "depth": 0.04}
+    built = box(45).override({"materials.gel": series | {"nu": 0.45}}).build()
     law = built.rig.contacts["ground"].law
     F_N, R_t, R_pad = 0.07, law.R_t.item(), law.friction.R_pad.item()
     over = law.friction.range(f64(F_N), law.R_t).item()
@@ -323,13 +268,11 @@ def test_friction_falls_no_faster_than_dashpots_of_law_and_pad_balance():
 
 # numbers of a law from its pad
 
-AUTO = dict.fromkeys(("K_n", "R_n", "K_t", "R_t"), "auto")
-
 
 def test_springs_and_dashpots_that_are_auto_follow_the_pad():
     """At the start, in place and where a law is extended; runs and derivatives with them are in
     `test_initial`."""
-    file = box(20, **AUTO)
+    file = box(20, **dict.fromkeys(("K_n", "R_n", "K_t", "R_t"), "auto"))
     assert not [one for one in check(file) if one.where == "contacts.ground"]
     built = file.build()
     law, E = built.rig.contacts["ground"].law, built.rig.parameter("materials.gel.E")
