@@ -6,7 +6,7 @@ import torch
 from conftest import COARSE, coarse, f64, grasped, paper, times, towards
 from torch import Tensor, nn
 
-from torchsoft import SimulationFailed, Trajectory, simulate
+from torchsoft import RigFile, SimulationFailed, Trajectory, simulate
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.solve.steps import given_steps
 
@@ -45,6 +45,16 @@ def test_error_falls_with_the_tolerance(go, exact):
         assert errors[-1] < 30 * rtol**0.8
         assert run.energy_residual_rel < 3 * rtol**0.7
     assert errors[0] > 5 * errors[1] > 10 * errors[2]
+
+
+def test_the_energy_residual_of_a_fall_falls_with_the_tolerance():
+    """An ellipse in free flight and on a pad, with long steps between outputs."""
+    ready = RigFile.ready("drop").override(outputs={"duration": 0.2, "snapshots": []}).build()
+    runs = [simulate(ready.rig, ready.t, y0=ready.y0, rtol=rtol) for rtol in (1e-4, 1e-6)]
+    assert runs[0].energy_residual_rel < 2e-4
+    assert runs[1].energy_residual_rel < 0.2 * runs[0].energy_residual_rel
+    flight = [float(run.energy_residual[run.t < 0.02].abs().max()) for run in runs]
+    assert max(flight) < 1e-9 * float(runs[0].injected[-1])
 
 
 def test_steps_are_short_where_it_touches_down_and_long_where_it_rests(go):
