@@ -239,12 +239,3 @@ def pytest_collection_finish() -> None:
     """Keep modules out of garbage collections, which are a twentieth of the time else."""
     gc.collect()
     gc.freeze()
-
-
-def listed(given: Any) -> Any:
-    """Lists in place of tensors, to the bit."""
-    if isinstance(given, Mapping):
-        return {name: listed(one) for name, one in given.items()}
-    if isinstance(given, list):
-        return [*map(listed, given)]
-    return given.tolist() if isinstance(given, Tensor) else given

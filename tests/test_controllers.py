@@ -14,7 +14,7 @@ from torchsoft.rigs import RigFile
 from torchsoft.rigs.check import check
 from torchsoft.rigs.written import to_toml
 
-KP, KD = 1.2e5, 440.0
+TIMING = {"outputs": {"duration": 0.3, "interval": 0.02}, "solver": {"rtol": 1e-6}}
 
 
 def test_coordinates_without_set_points_are_regulated():
@@ -34,8 +34,7 @@ def file(**changes: Any) -> RigFile:
             "gain": [[1e5, 0.0, 400.0, 0.0], [0.0, 1e5, 0.0, 400.0]],
         } | changes
     }  # fmt: skip
-    tree |= {"outputs": {"duration": 0.3, "interval": 0.02}, "solver": {"rtol": 1e-6}}
-    return RigFile.from_tree(tree)
+    return RigFile.from_tree(tree | TIMING)
 
 
 def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path):
@@ -44,8 +43,7 @@ def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path):
     read = RigFile.from_toml(tmp_path / "rig.toml")
     assert read.model_dump() == asked.model_dump()
     assert [str(one) for one in check(read) if one.severity != "note"] == []
-    timing = {"outputs": {"duration": 0.3, "interval": 0.02}, "solver": {"rtol": 1e-6}}
-    loops = RigFile.from_tree(coarse_tree() | timing)
+    loops = RigFile.from_tree(coarse_tree() | TIMING)
     runs = [one.build().run() for one in (read, loops)]
     assert "effort_jaw_bracket_x" in runs[0].units
     for name in ("x_disc", "theta_disc", "y_bracket"):

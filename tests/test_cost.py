@@ -14,7 +14,7 @@ from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost
 from torchsoft.rigs.written import template, to_toml
 
-SMOKE = Path(__file__).parents[1] / "data_gen" / "configs" / "smoke.toml"
+SMOKE = Path(__file__).parents[1] / "data_gen/configs/smoke.toml"
 CHEAP, LONG, LARGE = Cost(1e4, 60.0, 0.1), Cost(1e9, 2e5, 0.1), Cost(1e4, 60.0, 1e6)
 
 
@@ -46,11 +46,6 @@ def test_a_step_costs_more_on_a_finer_mesh_and_with_derivatives():
     assert rig_row(still()) * 2**30 > 8 * 4 * 242
 
 
-@pytest.fixture(scope="module")
-def smoke():
-    return Config.from_toml(SMOKE)
-
-
 @pytest.mark.parametrize(
     ("change", "seconds"),
     [
@@ -59,31 +54,27 @@ def smoke():
         ({"step": 1e-6}, (300.0, 3000.0)),
     ],
 )
-def test_what_a_dataset_costs(change, seconds, smoke):
-    price = cost(smoke.model_copy(update=change), 2)
+def test_what_a_dataset_costs(change, seconds):
+    price = cost(Config.from_toml(SMOKE).model_copy(update=change), 2)
     assert seconds[0] < price.seconds < seconds[1]
     assert price.memory < 1.0
     assert (price.disk > 100.0) == ("trajectories" in change)
 
 
-def test_a_run_that_takes_long_asks_first(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("command", "changes", "words"),
+    [
+        ("run", {"solver.step": 1e-7, "outputs.duration": 20.0}, r"about .* \(2e\+08 steps\).*"),
+        ("run", {"pads.lower.elements_y": 1000}, "GiB of memory; .*"),
+        ("check", {"pads.lower.elements_y": 1000}, "GiB of memory; .*"),
+    ],
+)
+def test_a_run_of_hours_or_of_the_machines_memory_asks_first(
+    command, changes, words, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    Path("rig.toml").write_text(
-        to_toml(template("t").override(solver={"step": 1e-7}, outputs={"duration": 20.0}))
-    )
-    assert main(["run", "rig.toml", "--out", "out"]) == 2
-    error = capsys.readouterr().err
-    assert re.search(r"this takes about .* \(2e\+08 steps\)", error), error
-    assert "or use --yes to begin" in error
-    assert not Path("out").exists()
-
-
-@pytest.mark.parametrize("command", [("check",), ("run", "--out", "out")], ids=["check", "run"])
-def test_a_rig_that_needs_the_machines_memory_asks_first(command, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("rig.toml").write_text(
-        to_toml(template("t").override(pads={"lower": {"elements_x": 80, "elements_y": 1000}}))
-    )
+    Path("rig.toml").write_text(to_toml(template("t").override(changes)))
     with mock.patch("torchsoft.cost.machine_memory", return_value=1.0):
-        assert main([command[0], "rig.toml", *command[1:]]) == 2
-    assert re.search(r"GiB of memory; .*or use --yes to begin", capsys.readouterr().err)
+        assert main([command, "rig.toml"]) == 2
+    assert re.search(words + "or use --yes to begin", capsys.readouterr().err)
+    assert [path.name for path in tmp_path.iterdir()] == ["rig.toml"]

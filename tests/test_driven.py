@@ -111,26 +111,16 @@ def test_modes_without_a_free_coordinate(built: BuiltRig):
     assert torch.equal(resting(rig, pressed)["indenter"], pressed["indenter"])
 
 
-def recorded(folder: Path, t: np.ndarray, y: np.ndarray, force: np.ndarray) -> list[str]:
-    """The files of an identification, by their paths."""
-    heading = "t [s],indenter.y [mm],indenter.load_y [N]"
-    table = np.stack((t, 1e3 * y, force), -1)
-    np.savetxt(folder / "loop.csv", table, "%.6f", ",", header=heading, comments="")
-    return [str(folder / name) for name in ("loop.csv", "fit.toml")]
-
-
-def interval(folder: Path, files: list[str]) -> tuple[float, float]:
-    """The 95 % interval of the first estimate."""
-    assert main(["identify", *files, "--out", str(folder / "out"), "--no-progress"]) == 0
-    return json.loads((folder / "out/answer.json").read_text())["estimates"][0]["ci95"]
-
-
-def test_identified_from_its_force(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_identified_from_its_force(tmp_path, monkeypatch, capsys):
     """The force alone is measured; its relaxation tells tau, though the clock is Unix time."""
+    monkeypatch.chdir(tmp_path)
     run = RigFile.from_toml(written(tmp_path)).build().run()
     force = run["indenter.load_y"].numpy() + np.random.default_rng(0).normal(0, 0.01, len(run.t))
-    (tmp_path / "fit.toml").write_text(FIT)
-    files = recorded(tmp_path, 1.7e9 + run.t.numpy(), run["y_indenter"].numpy(), force)
-    low, high = interval(tmp_path, files)
+    table = np.stack((1.7e9 + run.t.numpy(), 1e3 * run["y_indenter"].numpy(), force), -1)
+    heading = "t [s],indenter.y [mm],indenter.load_y [N]"
+    np.savetxt("loop.csv", table, "%.6f", ",", header=heading, comments="")
+    Path("fit.toml").write_text(FIT)
+    assert main(["identify", "loop.csv", "fit.toml", "--out", "out", "--no-progress"]) == 0
+    low, high = json.loads(Path("out/answer.json").read_text())["estimates"][0]["ci95"]
     assert "1 of 1 parameters identifiable" in capsys.readouterr().out
     assert low < 1.0 < high < low + 0.2

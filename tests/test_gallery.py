@@ -2,6 +2,7 @@
 
 import runpy
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,6 +18,12 @@ QUICK = (
     "first_run", "own_rig", "rig_from_a_file", "relaxation",
 )  # fmt: skip
 
+
+def found(result: Any, truth: dict[str, float]) -> bool:
+    """Whether every interval has the truth in it."""
+    return all(result[name].ci95[0] < one < result[name].ci95[1] for name, one in truth.items())
+
+
 ANSWERS = {
     "first_run": lambda n: abs(float(n["run"]["x_C"][1000]) - 40e-3) < 1e-6,
     "own_rig": lambda n: abs((n["x"][-1] - n["x"][0]).item() - 5e-3) < 1e-4,
@@ -29,14 +36,8 @@ ANSWERS = {
         n["found"].terms == 2 and abs(n["found"].values["E"] / 0.5e6 - 1) < 0.01
     ),
     "which_motion": lambda n: n["table"][3, 4] < n["table"][:3, 4].min(),  # mu_k by shaking
-    "identify": lambda n: all(
-        n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
-        for name, truth in IDENTIFIED.items()
-    ),
-    "identify_friction": lambda n: all(
-        n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
-        for name, truth in n["truth"].items()
-    ),
+    "identify": lambda n: found(n["result"], IDENTIFIED),
+    "identify_friction": lambda n: found(n["result"], n["truth"]),
     "plan_a_motion": lambda n: abs(n["run"]["x_C"][-1].item() - 52.3e-3) < 1e-4,
     "train_a_policy": lambda n: n["loss"].item() < 0.05,
     "learn_to_turn": lambda n: max(n["trained"]) < 0.1 < max(n["untrained"]),

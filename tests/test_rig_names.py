@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 import torch
-from conftest import COARSE, PAPER, coarse, f64, nested, still, times
+from conftest import COARSE, PAPER, coarse, nested, still, times
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_controllers import file as controlled
 
-from torchsoft import Body, BuiltRig, Circle, Profile, Reference, Rig, RigFile, hold
+from torchsoft import Body, BuiltRig, Profile, Reference, Rig, RigFile
 from torchsoft.rigs.build import READY, ready
 from torchsoft.rigs.written import to_toml
 
@@ -356,20 +356,3 @@ def test_a_built_rig_runs_as_its_file_says():
     assert one.run(rtol=1e-4).stats.steps != 6  # a choice of steps replaces the file's
     y0 = rig.state(disc={"x": 61e-3, "y": "rest"}, bracket={"x": 61e-3, "y": "touch"})
     assert one.run(times(0.01, 2), y0=y0)["x_C"][0] == 61e-3
-
-
-def test_coordinates_that_are_not_free_are_filled_in():
-    """A driven coordinate comes from its signal at t, a fixed one from its number; neither is in
-    the vector."""
-    rig = Rig(
-        bodies={"a": Body(1.0, Circle(0.01), x="driven", y=0.25), "b": Body(1.0, theta=0.1)},
-        pads={}, contacts={}, reference=hold(**{"a.x": 0.7}),
-    )  # fmt: skip
-    assert rig.layout.size == 2 * (1 + 2)
-    state = rig.unpack(f64(0.5, 3.0, 4.0, 0.05, 0.3, 0.4))
-    assert (state.pose["a"].tolist(), state.pose["b"].tolist()) == ([0.7, 0.25, 0.5], [3, 4, 0.1])
-    assert state.velocity["a"].tolist() == [0.0, 0.0, 0.05]
-    assert state.velocity["b"].tolist() == [0.3, 0.4, 0.0]
-    moved = rig.unpack(torch.zeros(6, dtype=torch.float64), f64(0.9, -2.0).reshape(1, 2))
-    assert moved.pose["a"].tolist() == [0.9, 0.25, 0.0]
-    assert moved.velocity["a"].tolist() == [-2.0, 0.0, 0.0]

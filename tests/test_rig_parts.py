@@ -19,6 +19,7 @@ from torchsoft.physics.shapes import Contour, RoundedBox, RoundedPolygon, Supere
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.check import check
 from torchsoft.rigs.geometry import Scene, collision
+from torchsoft.rigs.naming import merged as changed
 from torchsoft.rigs.written import template, to_toml
 
 SQUARE = [[-20e-3, -20e-3], [20e-3, -20e-3], [16e-3, 20e-3], [-16e-3, 20e-3]]
@@ -53,10 +54,6 @@ PADS = {
         QuadMesh,
     ),
 }
-
-
-def slow(*kinds: str) -> list[Any]:
-    return [pytest.param(kind, marks=pytest.mark.slow) for kind in kinds]
 
 
 @pytest.fixture(scope="module")
@@ -94,19 +91,6 @@ def network() -> nn.Sequential:
     return nn.Sequential(nn.Linear(4, 5), nn.Tanh(), nn.Linear(5, 1)).double()
 
 
-def changed(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """A tree with others put into it; a table of another kind replaces the whole."""
-    for name, value in changes.items():
-        old = tree.get(name)
-        inner = (
-            isinstance(old, dict)
-            and isinstance(value, dict)
-            and value.get("kind", old.get("kind")) == old.get("kind")
-        )
-        tree[name] = changed(dict(old), value) if inner and isinstance(old, dict) else value
-    return {name: value for name, value in tree.items() if value is not None}
-
-
 def coarse_tree() -> dict[str, Any]:
     """The template on a coarse mesh, its contact points on the nodes."""
     tree = template("t").model_dump(exclude_unset=True)
@@ -120,9 +104,7 @@ def coarse_tree() -> dict[str, Any]:
 
 def rig(folder: Path, **changes: Any) -> RigFile:
     """The template on a coarse mesh, changed."""
-    file = RigFile.from_tree(changed(coarse_tree(), changes))
-    file._folder = folder
-    return file
+    return RigFile.from_tree(changed(coarse_tree(), changes), folder)
 
 
 # shapes, materials, pads
@@ -145,10 +127,12 @@ def in_a_rig(kind: str, table: dict[str, Any]) -> dict[str, Any]:
 
 
 QUICK = "rounded_box", "curved"
-KINDS = [*MATERIALS, *QUICK, *slow(*sorted({*SHAPES, *PADS}.difference(QUICK)))]
+SLOW = sorted({*SHAPES, *PADS}.difference(QUICK))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [*MATERIALS, *QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in SLOW)]
+)
 def test_every_kind_of_part_is_built_written_and_runs(kind, folder):
     table, made = (SHAPES | MATERIALS | PADS)[kind]
     file = rig(folder, **in_a_rig(kind, table))
