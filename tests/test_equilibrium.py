@@ -8,7 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from conftest import GRASPED, PAPER, RUBBER, dry, f64, holding_force, press, rest, still, turning
+from conftest import (
+    GRASPED,
+    PAPER,
+    RUBBER,
+    dry,
+    f64,
+    holding_force,
+    press,
+    random_state,
+    rest,
+    still,
+    turning,
+)
 from conftest import coarse as build
 from fem_oracle import matrices
 from torch import Tensor
@@ -263,16 +275,9 @@ def test_a_start_that_cannot_be_is_rejected(given, words):
 # pads around given bodies
 
 
-def shaken(model: Rig, seed: int = 0) -> State:
-    """The grasp with bodies displaced by tenths of a millimetre and stretched points, sticking and
-    slipping; nothing moves."""
-    state = model.unpack(press(model).detach())
-    generator = torch.Generator().manual_seed(seed)
-    noise = lambda like: torch.randn(like.shape, generator=generator, dtype=torch.float64)
-    pose = {name: x + noise(x) * f64(1e-4, 2e-4, 0.02) for name, x in state.pose.items()}
-    pose["bracket"][2] = 0.0
-    stretch = {name: 5e-5 * noise(s) for name, s in state.stretch.items()}
-    return state._replace(pose=pose, stretch=stretch)
+def shaken(model: Rig) -> State:
+    """The grasp with bodies displaced and points stretched; nothing moves."""
+    return model.unpack(random_state(model, 0, slip=0.0))
 
 
 def around(rig: Rig, state: State) -> Tensor:
@@ -349,8 +354,6 @@ def test_what_cannot_settle_is_rejected():
     ):
         with pytest.raises(kind, match=message):
             around(model, state._replace(**changed))
-    with torch.inference_mode(), pytest.raises(ValueError, match=r"use torch\.no_grad\(\)"):
-        around(model, state)
 
 
 # a flat punch
@@ -360,19 +363,13 @@ FLAT, DEPTH = 14.5e-3, 1e-4
 """Half of the flat side of a box, and how deep it is pressed into each of two pads [m]."""
 
 
-def punched(K_n: float, elements_x: int) -> tuple[Rig, State, float]:
-    """The box pressed between the pads without weight; the force [N] on the bracket."""
-    changes = {"gravity": 0.0, "contact.K_n": K_n, "pad.elements_x": elements_x}
-    box = RoundedBox(half_width=15.5e-3, half_height=10e-3, radius=1e-3)
-    model = still(changes | {"pad.elements_y": elements_x // 30}, shape=box)
-    y = press(model, 2 * (PAD.height + 10e-3 - DEPTH) + 2.18e-3).detach()
-    return model, model.unpack(y), holding_force(model, y)
-
-
 def test_a_long_box_is_a_flat_punch_on_springs():
-    """On the same mesh, assembled by scikit-fem, with a spring K_n between each node under the flat
-    side and the box."""
-    model, state, force = punched(1.2e5, 120)
+    """Pressed between the pads without weight: on the same mesh, assembled by scikit-fem, with a
+    spring K_n between each node under the flat side and the box."""
+    box = RoundedBox(half_width=15.5e-3, half_height=10e-3, radius=1e-3)
+    model = still({"gravity": 0.0, "contact.K_n": 1.2e5}, shape=box)
+    y = press(model, 2 * (PAD.height + 10e-3 - DEPTH) + 2.18e-3).detach()
+    state, force = model.unpack(y), holding_force(model, y)
     pad = model.pads["L"]
     K_lambda, K_mu, _ = matrices(pad.mesh.nodes, pad.mesh.elements)
     lame_lambda, lame_mu = lame_moduli(pad.material.E.item(), pad.material.nu.item())
@@ -389,15 +386,14 @@ def test_a_long_box_is_a_flat_punch_on_springs():
     assert state.pads["L"][0, :, 1].numpy() == pytest.approx(expected, rel=1e-7, abs=1e-9)
 
 
-def grasped(elements_x: int, stiffening: float) -> tuple[float, float, int]:
-    """Force on the upper pad [N], height of the disc [m] and touching nodes in the full grasp."""
+def grasped(elements_x: int, stiffening: float) -> tuple[float, float]:
+    """Force on the upper pad [N] and height of the disc [m] in the full grasp."""
     mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
     K_n = stiffening * PAPER["laws.steel_on_rubber.K_n"]
     rig = PAPER.override(mesh | {"contact.K_n": K_n}).build().rig
     bracket = {"x": 60e-3, "y": GRASPED}
     state = rig.unpack(rig.state(disc={"x": 60e-3, "y": "rest"}, bracket=bracket))
-    touching = int((rig.penetration("U", state) > 0).sum())
-    return float(state.pads["U"][0, :, 1].sum()), float(state.pose["disc"][1]), touching
+    return float(state.pads["U"][0, :, 1].sum()), float(state.pose["disc"][1])
 
 
 @pytest.mark.slow
@@ -406,10 +402,10 @@ def test_the_full_grasp_converges_with_the_mesh_and_the_penalty():
     """The paper's height to the digits that it prints; by meshes of 60 to 480 elements the force
     tends to 70.54 N, with the square of the spacing, and by springs up to 16 times as stiff to that
     of a rigid contact, 79.33 N, with 1 / K_n."""
-    usual, y_C, touching = grasped(120, 1.0)
+    usual, y_C = grasped(120, 1.0)
     assert usual == pytest.approx(70.16, abs=0.01)
     assert y_C == pytest.approx(23.20e-3, abs=5e-6)
-    assert touching == 11
+
     coarse_mesh, stiff = grasped(60, 1.0)[0], grasped(120, 4.0)[0]
     assert usual + (usual - coarse_mesh) / 3 == pytest.approx(70.54, rel=2e-3)
     assert stiff + (stiff - usual) / 3 == pytest.approx(79.33, rel=5e-3)

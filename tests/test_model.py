@@ -18,8 +18,9 @@ T = times(0.02, 5)
 
 def same(one: Trajectory, other: Trajectory) -> bool:
     parts = [
-        [run.y, run.recorded, *run.channels.values(), *run.energy.values()] for run in (one, other)
-    ]
+        [run.y, run.recorded, *run.channels.values(), *run.energy.values(),
+         *run.contact_state.values()] for run in (one, other)
+    ]  # fmt: skip
     return all(torch.equal(a.detach(), b.detach()) for a, b in zip(*parts, strict=True))
 
 

@@ -1,18 +1,17 @@
 """What every motion guarantees, against closed forms and scipy: value and rate, gradients with
-respect to knots, other times, and copies."""
+respect to knots, and other times."""
 
-import pickle
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
-from conftest import f64, times
+from conftest import f64
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from torch.autograd import gradcheck
 
-from torchsoft import Profile, Reference, Sampled, hold
+from torchsoft import Profile, Reference, Sampled
 from torchsoft.physics.motion import Lines, Retimed, Waves, wave
 
 TIMES, VALUES = np.array([0.0, 0.4, 1.0, 1.5]), np.array([0.06, 0.04, 0.05, 0.01])
@@ -35,12 +34,6 @@ def sines(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return seventh(t) + 1e-3 * np.sin(phase) * ((t > SINCE) & (t < UNTIL))
 
 
-def waves() -> Waves:
-    return Waves(
-        (TIMES.tolist(), VALUES.tolist()), SINCE, UNTIL, wave(1e-3, 7.0, SWEEP, 0.3)
-    )  # fmt: skip
-
-
 def clip(f: Callable[..., NDArray[np.float64]]) -> Callable[..., NDArray[np.float64]]:
     return lambda t: f(t.clip(TIMES[0], TIMES[-1]))
 
@@ -59,7 +52,10 @@ MOTIONS = {
     "sampled with rates": (
         lambda: Sampled(TIMES, VALUES, RATES), clip(CubicHermiteSpline(TIMES, VALUES, RATES))
     ),
-    "waves": (waves, sines),
+    "waves": (
+        lambda: Waves((TIMES.tolist(), VALUES.tolist()), SINCE, UNTIL, wave(1e-3, 7.0, SWEEP, 0.3)),
+        sines,
+    ),
     "later and faster": (
         lambda: Retimed(Sampled(TIMES, VALUES), 1.02, -0.03),
         lambda t: clip(CubicSpline(TIMES, VALUES))((t + 0.03) / 1.02),
@@ -88,17 +84,16 @@ def test_values_are_the_closed_form_and_rates_their_slopes(case):
     assert (ahead - behind) / (2 * h) == pytest.approx(rate, abs=1e-5)
 
 
-def test_gradients_with_respect_to_knots_and_copies_are_the_motion_s(case):
-    """Knots changed in place count; a pickled copy is the same."""
+def test_gradients_with_respect_to_knots(case):
+    """Knots changed in place count."""
     signal, _ = case
     t = f64(-0.1, 0.1, 0.3, 0.4, 0.7, 1.3, 1.9)
     signal.values.requires_grad_(True)
     assert gradcheck(lambda *_: torch.stack(signal(t)), (signal.values,))
-    copied = pickle.loads(pickle.dumps(signal))
-    assert torch.equal(torch.stack(copied(t)), torch.stack(signal(t)))
+    before = signal(t)[0]
     with torch.no_grad():
-        copied.values.add_(0.01)
-    assert copied(t)[0].tolist() == pytest.approx((signal(t)[0] + 0.01).tolist(), abs=1e-14)
+        signal.values.add_(0.01)
+    assert signal(t)[0].tolist() == pytest.approx((before + 0.01).tolist(), abs=1e-14)
 
 
 @pytest.mark.parametrize("k", [2, 3, 4, 5])
@@ -132,15 +127,6 @@ def test_a_motion_at_other_times_keeps_all_of_it(case):
     away = (t[:, None] - signal.times).abs().amin(-1) > 1e-9  # lines jump at knots
     torch.testing.assert_close(rate * slope_there[away], slope[away], rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(moved.stops, rate * signal.stops + shift, rtol=0, atol=0)
-
-
-def test_a_reference_gives_named_signals_side_by_side():
-    reference, t = Reference(x=Profile([0.0, 1.0], [0.0, 1.0]), **hold(y=-2.0).signals), times(1, 5)
-    got = reference(t, ("y", "x", "y"))
-    assert torch.equal(got[:, 1], torch.stack(reference["x"](t), -1))
-    assert torch.equal(got[:, 0], got[:, 2])
-    assert got[0, 0].tolist() == [-2.0, 0.0]
-    assert reference(t, ()).shape == (5, 0, 2)
 
 
 @pytest.mark.parametrize("kind", [Profile, Lines, Sampled])

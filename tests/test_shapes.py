@@ -1,14 +1,13 @@
 """What every shape guarantees, against boundaries written down here: signed distance, unit normals,
-curvature, moments, support, gradients, and copies."""
+curvature, moments, support and gradients."""
 
-import pickle
 from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
-from conftest import f64, rest, still
+from conftest import COARSE, f64, rest, still
 from matplotlib.path import Path as Polygon
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicSpline
@@ -239,15 +238,9 @@ def test_moments_support_size_and_outline_are_those_of_the_boundary(case):
 
 
 @torch.no_grad()
-def test_copies_are_the_shape(case):
+def test_a_prepared_shape_is_the_shape(case):
     shape, boundary, _ = case
-    copied = pickle.loads(pickle.dumps(shape))
-    copied.load_state_dict({k: 1.01 * v for k, v in shape.state_dict().items()})
     x = torch.from_numpy(near(boundary, 20, BAND))
-    assert not torch.allclose(copied(x)[0], shape(x)[0], atol=1e-6)
-    copied.load_state_dict(shape.state_dict())
-    for given, expected in zip(copied(x), shape(x)):
-        assert torch.equal(given, expected)
     for given, expected in zip(shape.prepared()(x[:, None]), shape(x)):
         assert torch.equal(given[:, 0], expected)
 
@@ -285,8 +278,6 @@ def test_a_contour_is_read_from_a_file_whose_columns_have_names_and_units(tmp_pa
 
 
 # shapes in rigs
-
-COARSE = {"pad.elements_x": 60, "pad.elements_y": 3}
 
 
 def test_a_contour_made_sharp_afterwards_is_rejected():

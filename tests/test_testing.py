@@ -193,11 +193,8 @@ def test_parameters_without_effect_fail_where_they_are_named_and_are_reported_el
 # energies
 
 
-class Springy(nn.Module):
-    """A slip law that gives back what it takes."""
-
-    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        return 1.9 * E / R
+springy = lambda E, F_N, R: 1.9 * E / R
+"""A slip law that gives back what it takes."""
 
 
 def test_energies_balance_and_a_law_that_supplies_power_is_named():
@@ -205,7 +202,7 @@ def test_energies_balance_and_a_law_that_supplies_power_is_named():
     check_energy(rig, T, y0)
     with pytest.raises(CheckFailed, match="injected since is missing or too much"):
         check_energy(rig, T, y0, residual=0.0)
-    rig, y0 = slider(Springy())
+    rig, y0 = slider(springy)
     with pytest.raises(CheckFailed, match=r"at t = 0 s `(dashpots|slip)` is to dissipate energy"):
         check_power(rig, y0)
 
@@ -284,7 +281,7 @@ class DetachedPD(PD):
 WRONG = [
     (Coulomb(0.5, 0.4), r"the slip rate of `Coulomb` jumps by 2e-05 m/s at an effort of 0.05 N"),
     (SoftContact(1e5, 1.0, 1e5, 1.0, friction=SmoothSlip(0.8, 0.3, 1e-3)), "use a larger R_t"),
-    (Springy(), "or slip supplies power"),
+    (springy, "or slip supplies power"),
     (sliding(lambda E, F_N: 0.9 * E - F_N), "friction jumps at touch-down"),
     (sliding(lambda E, F_N: E - F_N.mean()), "uses? the number of points|mix them"),
     (sliding(lambda E, F_N: E - F_N if float(E.sum()) > -1 else E), "reading a value into Python"),
