@@ -334,8 +334,8 @@ def test_a_loop_that_is_about_to_close_is_not_judged():
 def test_steps_are_held_against_the_modes(step, is_coarse):
     """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
     less = {"pad.tau": 2e-3, "pad.elements_x": 60, "pad.elements_y": 2}
+    less |= {"outputs.duration": 1.0, "outputs.snapshots": []}
     file = RigFile.ready("paper").override(less, solver={"step": step})
-    file = file.override(outputs={"duration": 1.0, "snapshots": []})
     swings = [one for one in check(file) if "a mode of the rig swings with" in one.message]
     assert bool(swings) == is_coarse
 

@@ -291,9 +291,8 @@ def test_a_limit_needs_a_bound():
 
 def test_a_start_that_cannot_be_run_is_rejected():
     """A body that nothing holds."""
-    slippery = FILE.override(
-        laws={"dry": {"friction": {"kind": "smooth", "mu_s": 0.02, "mu_k": 0.02, "v_s": 0.05}}}
-    ).build()
+    friction = {"laws.dry.friction.mu_s": 0.02, "laws.dry.friction.mu_k": 0.02}
+    slippery = FILE.override(friction).build()
     limits = {"up": Limit(channel="y_object", low=-1e-3)}
     with pytest.raises(ValueError, match=r"no start of the plan can be run: draw 0"):
         plan(slippery.rig, torch.linspace(0, 3.0, 61), FREE, **TURNED, limits=limits,
