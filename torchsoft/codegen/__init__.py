@@ -96,7 +96,7 @@ def _forces(g: ScalarGraph, potentials: list[int], n: int) -> list[int]:
     u, rate = ([g.leaf("x", first + i) for i in range(n)] for first in (0, n))
     elastic = adjoints(g, {energy: g.one}, {}, dependent(g, u), u)
     viscous = adjoints(g, {potential: g.one}, {}, dependent(g, rate), rate)
-    power = g.total(g("mul", own, force) for own, force in zip(rate, viscous))
+    power = g.total(g("mul", v, force) for v, force in zip(rate, viscous))
     return [*(g("add", *both) for both in zip(elastic, viscous)), power]
 
 

@@ -166,10 +166,10 @@ class _Body:
         else:  # lane by lane
             before = "undef"
             for lane in range(self.lanes):
-                own = [f"{v}.{lane}.{i}" for i in range(len(operands))]
-                for name, operand in zip(own, operands):
+                extracted = [f"{v}.{lane}.{i}" for i in range(len(operands))]
+                for name, operand in zip(extracted, operands):
                     yield f"{name} = extractelement {self.number} {operand}, i32 {lane}"
-                yield from self.called(node, f"{v}.{lane}", own)
+                yield from self.called(node, f"{v}.{lane}", extracted)
                 after = v if lane == self.lanes - 1 else f"{v}.{lane}.all"
                 yield (
                     f"{after} = insertelement {self.number} {before}, double {v}.{lane}, i32 {lane}"
@@ -283,8 +283,8 @@ class Watch(Trace):
     def points(self, node: int) -> frozenset[int]:
         """Points that a node depends on."""
         if node not in self._points:
-            own = (self.graph.args[node][0] // self.size,) if self.graph.ops[node] == "x" else ()
-            self._points[node] = frozenset(own).union(*map(self.points, self.graph.operands(node)))
+            here = (self.graph.args[node][0] // self.size,) if self.graph.ops[node] == "x" else ()
+            self._points[node] = frozenset(here).union(*map(self.points, self.graph.operands(node)))
         return self._points[node]
 
     def __torch_dispatch__(

@@ -96,12 +96,12 @@ def left_out(
         law = compile_law(function, x[0], parameters, kind=kind, conjugates=conjugates)
         return evaluate(law, x, parameters, np.linspace(0.5, 1.7, law.outputs))
 
-    whole, own = made(opened()), made(Trace)
-    by_input = np.asarray(_differ(own.by_input, whole.by_input).any((0, 1)))
+    whole, plain = made(opened()), made(Trace)
+    by_input = np.asarray(_differ(plain.by_input, whole.by_input).any((0, 1)))
     if conjugates is not None:  # the forces are derivatives themselves
-        by_input[:conjugates] |= np.any(_differ(own.value, whole.value), axis=0)[:conjugates]
+        by_input[:conjugates] |= np.any(_differ(plain.value, whole.value), axis=0)[:conjugates]
     inputs = tuple(np.flatnonzero(by_input).tolist())
-    entries = np.any(_differ(own.by_parameter, whole.by_parameter), axis=0).tolist()
+    entries = np.any(_differ(plain.by_parameter, whole.by_parameter), axis=0).tolist()
     names, start = list[str](), 0
     for name, p in parameters.items():
         end = start + p.numel()

@@ -110,8 +110,8 @@ class Points:
         sloped = torch.nonzero(G.flatten(-2).any(-1).reshape(-1, len(N)).any(0))[:, 0]
         if not len(sloped):
             return lambda r: r
-        G, own = G[..., sloped, :, :], N[sloped]
-        components = torch.kron(own, torch.eye(2, dtype=N.dtype))
+        G, N_sloped = G[..., sloped, :, :], N[sloped]
+        components = torch.kron(N_sloped, torch.eye(2, dtype=N.dtype))
         B = (components @ A @ components.mT).unflatten(-1, (-1, 2))
         J = torch.eye(len(components), dtype=x.dtype)
         J = J - torch.einsum("rpj,...pjk->...rpk", B, G).flatten(-2)
@@ -119,7 +119,7 @@ class Points:
         def solve(r: Tensor) -> Tensor:
             step = torch.linalg.solve(J, r[..., sloped, :].flatten(-2)[..., None])
             force = (G @ step.unflatten(-2, (-1, 2)))[..., 0]
-            return r + N @ under_forces(A, own.mT @ force)
+            return r + N @ under_forces(A, N_sloped.mT @ force)
 
         return solve
 
@@ -147,8 +147,8 @@ class Banded:
         column = np.swapaxes(row, 1, 2)
         self.kept = (row >= 0) & (column >= 0)
         self.shares = pad.point_shares[:, :, None] * pad.point_shares[:, None, :]
-        own, shape = pad.surface.numpy()[pad.point_nodes], (*self.shares.shape, 2, 2)
-        dofs = 2 * own[:, :, None] + np.arange(2)  # (points, side, 2)
+        nodes, shape = pad.surface.numpy()[pad.point_nodes], (*self.shares.shape, 2, 2)
+        dofs = 2 * nodes[:, :, None] + np.arange(2)  # (points, side, 2)
         r = np.broadcast_to(dofs[:, :, None, :, None], shape)
         c = np.broadcast_to(dofs[:, None, :, None, :], shape)
         self.row = np.concatenate((row[self.kept], r.ravel()))
@@ -254,8 +254,8 @@ class Nodes:
 
         def solve(r: Tensor) -> Tensor:
             rows = r.reshape(-1, r.shape[-2] * r.shape[-1])
-            own = factors * (len(rows) // len(factors))
-            step: Any = _Solved.apply(rows, own, False)
+            per_row = factors * (len(rows) // len(factors))
+            step: Any = _Solved.apply(rows, per_row, False)
             return step.reshape(r.shape)
 
         return solve

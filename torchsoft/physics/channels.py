@@ -157,8 +157,8 @@ def of_signals(rig: Graph) -> Iterator[Channel]:
     for name, body in rig.bodies.items():
         for axis, freedom in body.freedom.items():
             if freedom == "driven":
-                own = f"{name}.{axis}"
-                uses.append((own, coordinate_unit(axis), f"motion that drives {own}"))
+                coordinate = f"{name}.{axis}"
+                uses.append((coordinate, coordinate_unit(axis), f"motion that drives {coordinate}"))
 
     def row(seen: Seen, i: int, rate: int) -> Tensor:
         return seen.signals[..., i, rate]
@@ -225,10 +225,10 @@ class Touch:
         for name, contact in rig.contacts.items():
             out[name] = every[slices["contact", name]][::2], rig.pads[contact.pad].point_coordinates
         for name, taxels in rig.taxels.items():
-            own = sparse.csr_array(taxels.weights(rig.pads[taxels.pad]))
+            share = sparse.csr_array(taxels.weights(rig.pads[taxels.pad]))
             parts = [out[key][0] for key in rig.contacts_of(taxels.pad)]
             out[name] = (
-                sum((own @ part for part in parts), sparse.csr_array((len(taxels.places), size))),
+                sum((share @ part for part in parts), sparse.csr_array((len(taxels.places), size))),
                 taxels.places,
             )
         return out
@@ -302,9 +302,9 @@ class Touch:
 
     def sums(self, names: Sequence[str]) -> Sums:
         """Weights of the channels: each one's sum, and then the divisors of centres."""
-        own = self.force_sums(names)
-        parts = [(one.at, one.weight) for one in own]
-        parts += [(one.at, one.over) for one in own if one.over is not None]
+        forces = self.force_sums(names)
+        parts = [(one.at, one.weight) for one in forces]
+        parts += [(one.at, one.over) for one in forces if one.over is not None]
         none: Any = [np.zeros(0, np.int64)], [np.zeros(0)]
         return Sums(
             np.cumsum([0, *(len(at) for at, _ in parts)]),

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes import Shape, parameter
-from torchsoft.physics.state import ages, begin_states, own_states
+from torchsoft.physics.state import ages, begin_states, law_states
 from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Ratio, Stiffness
 
 SlipLaw = Callable[..., Any]
@@ -41,7 +41,7 @@ def slip_of(
 ) -> tuple[Tensor, Tensor | None]:  # fmt: skip
     """Slip rate of a friction law, and the rates of its states, which begin where none are
     given."""
-    states = own_states(friction)
+    states = law_states(friction)
     if not states:
         return friction(E, F_N, R), None
     return friction(E, F_N, R, begin_states(friction, E.shape) if z is None else z, stage)

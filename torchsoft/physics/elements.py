@@ -46,23 +46,23 @@ def element_potentials(material: Material, factors: Tensor, x: Tensor) -> Tensor
 def element_energy(material: Material, factors: Tensor, x: Tensor) -> Tensor:
     """Energy (...) [J] of an element in the state x (..., inputs)."""
     depth, _, lame_lambda, lame_mu, *arms = factors.unbind(-1)
-    own, *others = places(QUADRILATERAL, x)
+    displaced, *others = places(QUADRILATERAL, x)
     if not isinstance(material, Hyperelastic):
-        return depth * linear(lame_lambda, lame_mu, *own, "gradient")
-    W = finite_energy(material, lame_mu, *own)
+        return depth * linear(lame_lambda, lame_mu, *displaced, "gradient")
+    W = finite_energy(material, lame_mu, *displaced)
     for share, flown in zip(arms[::2], others):
-        W = W + share * finite_energy(material, lame_mu, *own, flown)
+        W = W + share * finite_energy(material, lame_mu, *displaced, flown)
     return depth * W
 
 
 def element_potential(material: Material, factors: Tensor, x: Tensor) -> Tensor:
     """Dissipation potential (...) [W] of an element in the state x (..., inputs)."""
     depth, tau, lame_lambda, lame_mu, *arms = factors.unbind(-1)
-    own, *others = places(QUADRILATERAL, x)
+    displaced, *others = places(QUADRILATERAL, x)
     if not isinstance(material, Hyperelastic):
-        return depth * tau * linear(lame_lambda, lame_mu, *own, "rate")
+        return depth * tau * linear(lame_lambda, lame_mu, *displaced, "rate")
     bulk = lame_lambda + 2 / 3 * lame_mu
-    total = tau * finite_potential(bulk, lame_mu, *own)
+    total = tau * finite_potential(bulk, lame_mu, *displaced)
     for share, time, flown in zip(arms[::2], arms[1::2], others):
         total = total + share * time * flow_potential(bulk, lame_mu, *flown)
     return depth * total

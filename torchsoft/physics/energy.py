@@ -39,8 +39,8 @@ def spring_energy(rig: Graph, state: State, known: Displacements, kind: int) -> 
     total = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
     for name, contact in rig.contacts.items():
         depth = rig.penetration(name, state, known.get(contact.pad))
-        own = contact.law.stored(depth, state.stretch[name], rig.weight(name))
-        total = total + own[kind].sum(-1)
+        energies = contact.law.stored(depth, state.stretch[name], rig.weight(name))
+        total = total + energies[kind].sum(-1)
     return total
 
 
@@ -64,9 +64,9 @@ def stores(rig: Graph) -> dict[str, Store]:
     out["normal_springs"] = partial(spring_energy, kind=0)
     out["tangential_springs"] = partial(spring_energy, kind=1)
     for name, axes in rig.layout.free.items():
-        for key, own in ((name, [i for i in axes if i < 2]), (f"{name}_spin", [2] * (2 in axes))):
-            if own:
-                out[key] = partial(kinetic_energy, body=name, axes=own)
+        for key, which in ((name, [i for i in axes if i < 2]), (f"{name}_spin", [2] * (2 in axes))):
+            if which:
+                out[key] = partial(kinetic_energy, body=name, axes=which)
     for name, pad in rig.pads.items():
         if pad.inertial:
             out[f"kinetic_{name}"] = partial(inertial_energy, pad=name)
@@ -150,8 +150,8 @@ def contact_states(
     """
     out = {}
     for name, pad in rig.pads.items():
-        own = rig.contacts_of(name)
-        touched = {key: force[key][..., 0].flatten(0, -2).any(0).nonzero()[:, 0] for key in own}
+        keys = rig.contacts_of(name)
+        touched = {key: force[key][..., 0].flatten(0, -2).any(0).nonzero()[:, 0] for key in keys}
         u = rig.displacement(name, state)
         rate = rates[name][..., :2] if pad.nodal else _rates(rig, name, touched, state, u, force)
         for key, which in touched.items():

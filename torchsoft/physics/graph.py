@@ -37,8 +37,8 @@ from torchsoft.physics.state import (
     ages,
     begin_states,
     body_blocks,
-    own_blocks,
-    own_states,
+    law_blocks,
+    law_states,
 )
 from torchsoft.physics.validity import Backwards
 from torchsoft.quantity import Gravity
@@ -217,7 +217,7 @@ class Graph(nn.Module):
         for name, axes in free.items():
             blocks += body_blocks(name, axes)
         for name, actuator in self.actuators.items():
-            blocks += own_blocks("control", name, [*actuator.states.values()])
+            blocks += law_blocks("control", name, [*actuator.states.values()])
         return Layout(free, blocks)
 
     @property
@@ -270,18 +270,18 @@ class Graph(nn.Module):
         are those that they start with, at t [s] of a reference, by default the rig's; ages only at
         points that touch."""
         friction = {name: self.friction_of(name, state) for name in self.contacts}
-        own = {name: both[0] for name, both in friction.items() if both}
-        for name, z in own.items():
+        friction_states = {name: both[0] for name, both in friction.items() if both}
+        for name, z in friction_states.items():
             if name not in state.friction and ages(self.contacts[name].law.friction):
                 touches = (self.penetration(name, state) > 0)[..., None, :]
-                own[name] = torch.where(touches, z, 0.0)
+                friction_states[name] = torch.where(touches, z, 0.0)
         control = dict(state.control)
         if missing := [k for k, one in self.actuators.items() if one.states and k not in control]:
             signals = self.follow(t, reference).expand(
                 *state.pose[next(iter(self.bodies))].shape[:-1], -1, -1
             )
             control |= {k: self.actuator_response(k, state, signals)[2] for k in missing}
-        return self.layout.pack(state._replace(friction=own, control=control))
+        return self.layout.pack(state._replace(friction=friction_states, control=control))
 
     def base_motion(self, name: str, state: State) -> tuple[Tensor, Tensor]:
         """Pose and velocity (..., 3) of a pad's base."""
@@ -365,8 +365,8 @@ class Graph(nn.Module):
             name: loads[name] / torch.stack(body.masses) for name, body in self.bodies.items()
         }  # (17), (18)
         points = {name: one.law.rates.mT for name, one in graph.interfaces.items()}
-        stretch = {name: own[..., 0, :] for name, own in points.items()}
-        friction = {name: own[..., 1:, :] for name, own in points.items()}
+        stretch = {name: rate[..., 0, :] for name, rate in points.items()}
+        friction = {name: rate[..., 1:, :] for name, rate in points.items()}
         control = {name: self.actuator_response(name, state, signals)[1] for name in state.control}
         return self.pack(State(pads, stretch, state.velocity, rates, velocity, friction, control))
 
@@ -416,7 +416,7 @@ class Graph(nn.Module):
             flows[f"{name}_spin"] = state.velocity[name][..., None, 2:]
         ports, interfaces, branches = {}, {}, {}
         for name, pad in self.pads.items():
-            own = self.contacts_of(name)
+            contacts = self.contacts_of(name)
             r_B, v_B = self.base_motion(name, state)
             u, angle = self.displacement(name, state), r_B[..., 2, None]
             moment_arm = turned(pad.positions + u, angle)
@@ -425,11 +425,11 @@ class Graph(nn.Module):
                 flows[f"pad_{name}"] = turned(state.rates[name], angle)
                 u_dot = turned(flows[f"pad_{name}"] - base_rate, -angle)
             else:
-                u_dot = torch.zeros_like(u) if settled else self._rates(name, own, state, u)
+                u_dot = torch.zeros_like(u) if settled else self._rates(name, contacts, state, u)
                 if not settled and pad.fields > 1:
                     branches[name] = self._branch_rates(name, state)
                 flows[f"pad_{name}"] = base_rate + turned(u_dot, angle)
-            for key in own:
+            for key in contacts:
                 interfaces[key] = self._interface(key, state, u, u_dot, flows)
                 element = (
                     f"C: K_n,{key}",
@@ -444,7 +444,7 @@ class Graph(nn.Module):
             effort = (
                 pad.internal_force(u, u_dot)
                 if pad.inertial and not settled
-                else self._left(name, own, ports, u, angle)
+                else self._left(name, contacts, ports, u, angle)
             )
             ports[f"pad_{name}"] = self._pad_port(name, effort, moment_arm, angle)
         return Evaluation(ports | self._sources(state, signals), flows, interfaces, branches)
@@ -475,30 +475,32 @@ class Graph(nn.Module):
         """States (..., states, points) of a contact's law of friction, as they begin where `state`
         has none; an empty list for a law without."""
         friction = self.contacts[key].law.friction
-        if not own_states(friction):
+        if not law_states(friction):
             return []
         if key in state.friction:
             return [state.friction[key]]
         return [begin_states(friction, state.stretch[key].shape).mT]
 
-    def point_forces(self, own: Sequence[str], state: State, u: Tensor, u_dot: Tensor) -> Tensor:
+    def point_forces(
+        self, contacts: Sequence[str], state: State, u: Tensor, u_dot: Tensor
+    ) -> Tensor:
         """Sum of the forces of some contacts on the points of their pad (..., points, 2) [N], in
         the base's frame."""
         total = torch.zeros_like(u)
-        for key in own:
+        for key in contacts:
             x = self.point_inputs(key, state, u, u_dot)
             total = total + interface_law(self.contacts[key].law, self.shape_of(key), x)[..., :2]
         return total
 
-    def _rates(self, name: str, own: Sequence[str], state: State, u: Tensor) -> Tensor:
+    def _rates(self, name: str, contacts: Sequence[str], state: State, u: Tensor) -> Tensor:
         """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises
         `NoRates` where Newton's method does not converge."""
         pad = self.pads[name]
-        law = lambda rate: self.point_forces(own, state, pad.interpolation @ u, rate)
+        law = lambda rate: self.point_forces(contacts, state, pad.interpolation @ u, rate)
         if pad.nodal:
-            return self._field_rates(name, state, 0, law if own else None)
+            return self._field_rates(name, state, 0, law if contacts else None)
         free, P = free_rates(pad, state.pads[name], 0.0)
-        if not own:
+        if not contacts:
             return free
         with torch.no_grad():  # without rates the springs alone push: that holds the pad nearly
             first = law(torch.zeros_like(pad.interpolation @ free))
@@ -521,9 +523,9 @@ class Graph(nn.Module):
         them."""
         pad, part = self.pads[name], state.pads[name]
         at, dofs = pad.at_corners(part), QUADRILATERAL.dofs
-        own = slice(dofs * field, dofs * (field + 1))
-        others = own.start, at.shape[-1] - own.stop
-        internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., own]
+        entries = slice(dofs * field, dofs * (field + 1))
+        others = entries.start, at.shape[-1] - entries.stop
+        internal = lambda rate: pad.element_forces(at, functional.pad(rate, others))[..., entries]
         nodes, none = Nodes(pad, internal, law), torch.zeros_like(part[..., :2])
         try:
             rate, solve, left = newton(nodes, none, RATE_TOLERANCE, RATE_ITERATIONS)
@@ -567,12 +569,12 @@ class Graph(nn.Module):
         return Interface(frame, law, transformer, transformer.flow(flows))
 
     def _left(
-        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, angle: Tensor
+        self, name: str, contacts: list[str], ports: Mapping[str, Port], u: Tensor, angle: Tensor
     ) -> Tensor:
         """Effort (..., nodes, 2) [N] of the field of a pad without an I field, in its base's axes:
         what the contacts leave at the junction."""
-        contacts = net_efforts({k: ports[f"contact_{k}"] for k in own}, self.junctions)
-        return turned(contacts[f"pad_{name}"], -angle) if own else torch.zeros_like(u)
+        efforts = net_efforts({k: ports[f"contact_{k}"] for k in contacts}, self.junctions)
+        return turned(efforts[f"pad_{name}"], -angle) if contacts else torch.zeros_like(u)
 
     def _pad_port(self, name: str, effort: Tensor, moment_arm: Tensor, angle: Tensor) -> Port:
         """The pad's viscoelastic field on its strain rate: node velocities less those of its base
@@ -607,8 +609,8 @@ class Graph(nn.Module):
             )
             force = self.actuator_effort(name, state, signals)[..., None, None]
             eye = torch.eye(3, dtype=torch.float64)[None, COORDINATES.index(axis), None]
-            own, row = (f"{body}_spin", eye[..., 2:]) if axis == "theta" else (body, eye[..., :2])
-            blocks, senses = {own: Block(row)}, tuple(one for one in sensed if one != own)
+            key, row = (f"{body}_spin", eye[..., 2:]) if axis == "theta" else (body, eye[..., :2])
+            blocks, senses = {key: Block(row)}, tuple(one for one in sensed if one != key)
             if actuator.resists:  # what the coordinate does to the ground, which does not turn
                 blocks[GROUND] = Block(-eye[..., :2])
             out[f"control_{name}"] = Port(

@@ -156,15 +156,15 @@ class Hyperelastic(OneTime):
         if wrong := self._rotation_fault(F, P):
             return wrong
         one = torch.eye(2, dtype=torch.float64)
-        own = torch.einsum("ij,kl->ijkl", one, one) * (bulk - 2 / 3 * shear)
-        own = own + shear * torch.einsum("ik,jl->ijkl", one, one)
-        own = (own + shear * torch.einsum("il,jk->ijkl", one, one)).reshape(4, 4)
-        off = (A[0] - own).abs().nan_to_num(torch.inf)
+        wanted = torch.einsum("ij,kl->ijkl", one, one) * (bulk - 2 / 3 * shear)
+        wanted = wanted + shear * torch.einsum("ik,jl->ijkl", one, one)
+        wanted = (wanted + shear * torch.einsum("il,jk->ijkl", one, one)).reshape(4, 4)
+        off = (A[0] - wanted).abs().nan_to_num(torch.inf)
         if not float(off.max()) <= ALIKE * shear:
             i, j = divmod(int(off.argmax()), 4)
             return (
                 f"the energy's modulus of the stress P_{ENTRIES[i]} by F_{ENTRIES[j]} at small "
-                f"strains is {A[0, i, j]:.6g} Pa, but {own[i, j]:.6g} Pa of its E and nu; make "
+                f"strains is {A[0, i, j]:.6g} Pa, but {wanted[i, j]:.6g} Pa of its E and nu; make "
                 "them agree"
             )
         return self._stability_fault(F, A)
@@ -308,8 +308,8 @@ class Ogden(_ByShear):
         depth: Depth, moduli: Moduli = (), times: Times = (),
     ) -> None:  # fmt: skip
         super().__init__(None, nu, rho, tau, depth, moduli, times)
-        own = {"mu": "mu", "alpha": "alpha"}
-        self.terms = numbered(self, "Ogden's energy", own, mu, alpha)
+        lists = {"mu": "mu", "alpha": "alpha"}
+        self.terms = numbered(self, "Ogden's energy", lists, mu, alpha)
         if any(exponent.item() == 0.0 for _, exponent in self.series()):
             raise ValueError("an exponent `alpha` is zero; leave that term out")
 
@@ -389,8 +389,8 @@ arguments."""
 
 
 def described(material: Material) -> dict[str, Any] | None:
-    """Kind and numbers of a material of this package, None for one of the user's own."""
-    kind = next((name for name, own in KINDS.items() if type(material) is own), None)
+    """Kind and numbers of a material of this package, None for a custom one."""
+    kind = next((name for name, cls in KINDS.items() if type(material) is cls), None)
     if kind is None:
         return None
     numbers, lists = dict[str, Any](), dict[tuple[str, ...], Any]()

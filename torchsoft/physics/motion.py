@@ -455,7 +455,7 @@ class Reference(nn.Module):
     def is_plain(self, names: Sequence[str]) -> bool:
         """Whether these signals are polynomials of this package's, and nothing else decides their
         values."""
-        return not self.own_way and all(polynomial(self[name]) for name in names)
+        return not self.overridden and all(polynomial(self[name]) for name in names)
 
     def plain(self, names: Sequence[str]) -> list[Piecewise] | None:
         """These signals, if they are plain; else None. Raises `ValueError` for knots that are
@@ -464,7 +464,7 @@ class Reference(nn.Module):
         return chosen if self.is_plain(names) else None  # pyright: ignore[reportReturnType]
 
     @property
-    def own_way(self) -> bool:
+    def overridden(self) -> bool:
         """Whether anything but its signals decides the values."""
         changed = type(self).forward is not Reference.forward
         return bool(changed or self._forward_hooks or self._forward_pre_hooks)
@@ -475,7 +475,7 @@ class Reference(nn.Module):
         it."""
         if origin == 0:
             return self
-        if self.own_way:
+        if self.overridden:
             return _Since(self, origin)
         out = Reference()
         out.origin = self.origin + origin
@@ -491,8 +491,8 @@ class Reference(nn.Module):
         """The same with other signals by these names; itself where there are none."""
         if not signals:
             return self
-        out, own = copy(self), {name.replace(".", ":"): one for name, one in signals.items()}
-        out._modules = self._modules | {"signals": nn.ModuleDict({**self.signals, **own})}
+        out, modules = copy(self), {name.replace(".", ":"): one for name, one in signals.items()}
+        out._modules = self._modules | {"signals": nn.ModuleDict({**self.signals, **modules})}
         return out
 
 
@@ -512,8 +512,8 @@ class _Since(Reference):
 def polynomial(signal: nn.Module) -> bool:
     """Whether a signal is made of polynomials of this package's and nothing else decides its
     values."""
-    own = isinstance(signal, Piecewise) and type(signal).__module__.startswith("torchsoft.")
-    return own and not (signal._forward_hooks or signal._forward_pre_hooks)
+    built_in = isinstance(signal, Piecewise) and type(signal).__module__.startswith("torchsoft.")
+    return built_in and not (signal._forward_hooks or signal._forward_pre_hooks)
 
 
 def hold(**values: float) -> Reference:

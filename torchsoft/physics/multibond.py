@@ -110,9 +110,9 @@ def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx
             "R"
         ):  # a massless pad's flow is set by the R field that its own port shows
             continue
-        own, kind = f"{name}: own", junction.element.split(":")[0]
-        graph.add_node(own, kind=kind, label=junction.element)
-        graph.add_edge(*((own, name) if kind == "Sf" else (name, own)), activated=False)
+        node, kind = f"{name}: own", junction.element.split(":")[0]
+        graph.add_node(node, kind=kind, label=junction.element)
+        graph.add_edge(*((node, name) if kind == "Sf" else (name, node)), activated=False)
     for name, port in ports.items():
         hub = f"{name}: field" if name in junctions else name
         graph.add_node(hub, kind="MTF", label=name)
@@ -121,9 +121,9 @@ def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx
         for junction in port.senses:
             graph.add_edge(junction, hub, activated=True)
         for element in port.elements:
-            own = f"{name}: {element}"
-            graph.add_node(own, kind=element.split(":")[0], label=element)
-            graph.add_edge(*((own, hub) if port.source else (hub, own)), activated=False)
+            node = f"{name}: {element}"
+            graph.add_node(node, kind=element.split(":")[0], label=element)
+            graph.add_edge(*((node, hub) if port.source else (hub, node)), activated=False)
     return graph
 
 

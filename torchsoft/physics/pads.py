@@ -109,10 +109,10 @@ class Pad(nn.Module):
             torch.from_numpy(self.placed(mesh.nodes[mesh.free][kept])),
             persistent=False,
         )
-        own = mesh.surface if self.nodal else np.arange(len(kept))
-        self.register_buffer("surface", torch.from_numpy(own.copy()), persistent=False)
+        surface = mesh.surface if self.nodal else np.arange(len(kept))
+        self.register_buffer("surface", torch.from_numpy(surface.copy()), persistent=False)
         self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
-        interpolation = shape_functions(own[self.point_nodes], self.point_shares, len(kept))
+        interpolation = shape_functions(surface[self.point_nodes], self.point_shares, len(kept))
         self.register_buffer("interpolation", torch.from_numpy(interpolation), persistent=False)
 
     def remeshed(self, finer: int, points: int) -> "Pad":
@@ -147,9 +147,9 @@ class Pad(nn.Module):
         return pad
 
     def described(self) -> dict[str, Any]:
-        """Numbers and names of the pad as it is now, for files; not its mesh. Of a material of the
-        user's own only the small strains of the relaxed one are known."""
-        own = {name: getattr(self, name) for name in ("base", "angle", "mirrored", "inertial")}
+        """Numbers and names of the pad as it is now, for files; not its mesh. Of a custom
+        material only the small strains of the relaxed one are known."""
+        settings = {name: getattr(self, name) for name in ("base", "angle", "mirrored", "inertial")}
         ratios = {name: getattr(self, name) for name in ("E_ratio", "tau_ratio")}
         known = {name: None if one is None else one.item() for name, one in ratios.items()}
         material = None if len(self.material.added) else described(self.material)
@@ -157,7 +157,7 @@ class Pad(nn.Module):
             relaxed = {name: getattr(self.material, name).item() for name in RELAXED}
             material = {"kind": None, "finite": isinstance(self.material, Hyperelastic), **relaxed}
         origin = self.origin.tolist()
-        return {**own, **known, "points": self.points, "origin": origin, "material": material}
+        return {**settings, **known, "points": self.points, "origin": origin, "material": material}
 
     @classmethod
     def again(cls, described: Mapping[str, Any], mesh: Mesh) -> "Pad":
@@ -206,18 +206,18 @@ class Pad(nn.Module):
     def blocks(self, name: str) -> list[StateBlock]:
         """States of the pad called `name`: forces or displacements, and rates of one with
         inertia."""
-        own = StateBlock.of("pads", name, self.state_shape, "m" if self.nodal else "N")
+        block = StateBlock.of("pads", name, self.state_shape, "m" if self.nodal else "N")
         rates = StateBlock.of("rates", name, (self.nodes, 2), "m/s")
-        return [own, rates] if self.inertial else [own]
+        return [block, rates] if self.inertial else [block]
 
     @property
     def fields(self) -> int:
         """Displacements of a nodal pad's nodes: their own, and those of every relaxing branch."""
         return self.branches if isinstance(self.material, Hyperelastic) else 1
 
-    def placed(self, own: Array) -> Array:
-        """Places (..., 2) in the pad's own frame, in the base's."""
-        return own @ self.axes.numpy().T + self.origin.numpy()
+    def placed(self, places: Array) -> Array:
+        """Places (..., 2) in the base's frame of `places` in the pad's own."""
+        return places @ self.axes.numpy().T + self.origin.numpy()
 
     @property
     def space(self) -> Array:
@@ -238,8 +238,8 @@ class Pad(nn.Module):
         face = self.mesh.face
         way = np.linalg.norm(np.diff(self.mesh.nodes[face], axis=0), axis=1).cumsum()
         along = np.concatenate(([0.0], way)) - 0.5 * way[-1]
-        own = along[~self.mesh.bonded[face]]
-        return (self.point_shares * own[self.point_nodes]).sum(-1)
+        nodes = along[~self.mesh.bonded[face]]
+        return (self.point_shares * nodes[self.point_nodes]).sum(-1)
 
     def unit_compliance(self) -> tuple[Tensor, Tensor]:
         """C for E depth = 1 and its derivative by nu, at the material's own nu, in the base's
@@ -275,10 +275,10 @@ class Pad(nn.Module):
         """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
         elements of its chain, or of its strain energy W."""
         if isinstance(self.material, Hyperelastic):
-            own = name if self.fields == 1 else f"{name},0..{self.fields - 1}"
-            return f"C: W_{own}", f"R: R_{own}"
-        own = name if self.branches == 1 else f"{name},1..{self.branches}"
-        return f"C: [K_{own}]^-1", f"R: [R_{own}]"
+            indices = name if self.fields == 1 else f"{name},0..{self.fields - 1}"
+            return f"C: W_{indices}", f"R: R_{indices}"
+        indices = name if self.branches == 1 else f"{name},1..{self.branches}"
+        return f"C: [K_{indices}]^-1", f"R: [R_{indices}]"
 
     def masses(self) -> Tensor:
         """Lumped mass of each node that moves [kg], (nodes,); the bonded nodes' masses are left
@@ -307,8 +307,8 @@ class Pad(nn.Module):
         """Nodal vectors (..., nodes, 2 fields) at the corners of the elements (..., elements, 8
         fields), field by field, zero where they are bonded."""
         held, dofs = torch.from_numpy(self.corners < 0), torch.from_numpy(self.corners.clip(0))
-        own = [torch.where(held, 0.0, one.flatten(-2)[..., dofs]) for one in x.split(2, -1)]
-        return own[0] if len(own) == 1 else torch.cat(own, -1)
+        fields = [torch.where(held, 0.0, one.flatten(-2)[..., dofs]) for one in x.split(2, -1)]
+        return fields[0] if len(fields) == 1 else torch.cat(fields, -1)
 
     def from_corners(self, f: Tensor) -> Tensor:
         """Sum (..., nodes, 2) of vectors at the corners of the elements (..., elements, 8)."""
@@ -361,12 +361,12 @@ class Pad(nn.Module):
             z = part.flatten(-2)
             return 0.5 * (fractions * ((z @ self.compliance()) * z).sum(-1)).sum(-1)
 
-        def own(u: Tensor) -> Tensor:
+        def energy_of(u: Tensor) -> Tensor:
             at = self.at_corners(u)
             return element_energy(*self.element_inputs(at, torch.zeros_like(at))).sum(-1)
 
         parts = part.reshape(-1, *part.shape[-2:]).split(SAMPLES)
-        energy = [checkpoint(own, one, use_reentrant=False) for one in parts]
+        energy = [checkpoint(energy_of, one, use_reentrant=False) for one in parts]
         return torch.cat(energy).reshape(part.shape[:-2])
 
     def dissipation(self, part: Tensor, given: Tensor) -> Tensor:
@@ -412,16 +412,16 @@ class Pad(nn.Module):
         u_s.
         """
         mesh = self.mesh
-        own = (u.reshape(-1, *u.shape[-2:]) @ self.axes.numpy()).reshape(-1, 2 * u.shape[-2])
-        free = np.zeros((len(own), 2 * len(mesh.free)))
+        local = (u.reshape(-1, *u.shape[-2:]) @ self.axes.numpy()).reshape(-1, 2 * u.shape[-2])
+        free = np.zeros((len(local), 2 * len(mesh.free)))
         if self.nodal:
-            free[:] = own
+            free[:] = local
         else:
             factor, interior, K_is = interior_solver(mesh, self.material.nu.item())
-            free[:, dofs_of(mesh.surface)] = own
-            free[:, interior] = -factor.solve(K_is @ own.T).T
-        out = np.zeros((len(own), len(mesh.nodes), 2))
-        out[:, mesh.free] = free.reshape(len(own), -1, 2)
+            free[:, dofs_of(mesh.surface)] = local
+            free[:, interior] = -factor.solve(K_is @ local.T).T
+        out = np.zeros((len(local), len(mesh.nodes), 2))
+        out[:, mesh.free] = free.reshape(len(local), -1, 2)
         return out.reshape(*u.shape[:-2], -1, 2)
 
     def surface_points(self, u: Array) -> Array:
@@ -460,7 +460,7 @@ class Pad(nn.Module):
         a pad at finite strain, P F^T / det F of the first Piola-Kirchhoff stress P = dW/dF. The
         part that the dashpots carry is not in them.
 
-        Raises `ValueError` for an energy of the user's own, which runs do not hold.
+        Raises `ValueError` for a custom energy, which runs do not hold.
         """
         ratio = 1.0 if self.E_ratio is None else self.E_ratio.item()
         if not isinstance(self.material, Hyperelastic):
@@ -484,7 +484,7 @@ class Pad(nn.Module):
 
 
 RELAXED = ("E", "nu", "rho", "depth")
-"""Numbers of a material that files keep of one of the user's own."""
+"""Numbers that files keep of a custom material."""
 
 
 def von_mises(stress: Array) -> Array:
@@ -532,14 +532,14 @@ def contact_points(mesh: Mesh, points: int) -> tuple[Any, Array, Array]:
     if points == 0:
         nodes = np.tile(np.arange(count)[:, None], side)
         return nodes, np.tile(np.eye(side)[0], (count, 1)), mesh.tributary
-    own = np.arange(0, count - 1, side - 1)[:, None] + np.arange(side)  # (sides, side)
-    places, shares, lengths = mesh.nodes[mesh.free[mesh.surface]][own], [], []
+    sides = np.arange(0, count - 1, side - 1)[:, None] + np.arange(side)  # (sides, side)
+    places, shares, lengths = mesh.nodes[mesh.free[mesh.surface]][sides], [], []
     for xi, weight in zip(*np.polynomial.legendre.leggauss(points)):
         functions, slopes = mesh.element.functions(xi, -1.0)
         shares.append(functions[:side])
         lengths.append(weight * np.linalg.norm(slopes[:side, 0] @ places, axis=-1))
-    nodes = np.repeat(own, points, 0)
-    return nodes, np.tile(shares, (len(own), 1)), np.stack(lengths, -1).ravel()
+    nodes = np.repeat(sides, points, 0)
+    return nodes, np.tile(shares, (len(sides), 1)), np.stack(lengths, -1).ravel()
 
 
 # Massless pads: the relation between nodal forces and rates.

@@ -15,8 +15,8 @@ from torchsoft.physics.state import (
     State,
     StateBlock,
     begin_states,
-    own_blocks,
-    own_states,
+    law_blocks,
+    law_states,
 )
 from torchsoft.quantity import (
     DerivativeGain,
@@ -127,9 +127,9 @@ class Contact(nn.Module):
 
     def blocks(self, name: str, points: int) -> list[StateBlock]:
         """States of so many contact points: stretches, and those of the law of friction."""
-        units = [one.unit for one in own_states(self.law.friction).values()]
+        units = [one.unit for one in law_states(self.law.friction).values()]
         stretch = StateBlock.of("stretch", name, (points,), "m")
-        return [stretch, *own_blocks("friction", name, units, (points,))]
+        return [stretch, *law_blocks("friction", name, units, (points,))]
 
 
 def coordinate_unit(name: str) -> str:
@@ -175,7 +175,7 @@ class Integral(nn.Module):
 
     def __init__(self, law: nn.Module, Ki: IntegralGain, *, reversed: bool = False) -> None:
         super().__init__()
-        if own_states(law):
+        if law_states(law):
             raise ValueError(
                 "`law` of integral action must have no states of its own; put the lag around it: "
                 "Lagging(Integral(law, Ki), lag)"
@@ -205,14 +205,14 @@ class Lagging(nn.Module):
 
     @property
     def states(self) -> dict[str, OwnState]:
-        own = own_states(self.law)
-        several = sum(name.startswith("effort") for name in own)
-        return own | {f"effort_{several + 1}" if several else "effort": OwnState("F")}
+        states = law_states(self.law)
+        several = sum(name.startswith("effort") for name in states)
+        return states | {f"effort_{several + 1}" if several else "effort": OwnState("F")}
 
     def begin(self, *seen: Tensor) -> Tensor:
         """States (..., states) at the start."""
-        own = begun(self.law, seen)
-        return torch.cat((own, respond(self.law, seen, own)[0][..., None]), -1)
+        states = begun(self.law, seen)
+        return torch.cat((states, respond(self.law, seen, states)[0][..., None]), -1)
 
     def forward(self, *given: Any) -> tuple[Tensor, Tensor]:
         *seen, z, stage = given
@@ -226,13 +226,13 @@ def respond(
 ) -> tuple[Tensor, Tensor]:
     """Effort of a control law at the end of a stage [s] that begins with its states z (..., n), and
     their rates."""
-    return law(*seen, z, stage) if own_states(law) else (law(*seen), z)
+    return law(*seen, z, stage) if law_states(law) else (law(*seen), z)
 
 
 def begun(law: Callable[..., Any], seen: Sequence[Tensor]) -> Tensor:
     """States (..., n) that a control law begins with: by its method `begin` of what it sees at the
     start, else by their parameters, else at zero."""
-    if own_states(law) and hasattr(law, "begin"):
+    if law_states(law) and hasattr(law, "begin"):
         return law.begin(*seen)
     return begin_states(law, seen[2].shape)
 
@@ -389,7 +389,7 @@ class Actuator(nn.Module):
         units = {"q": coordinate_unit(self.measures[0]), "F": self.effort_unit}
         return {
             name: ".".join(units.get(part, part) for part in one.unit.split("."))
-            for name, one in own_states(self.law).items()
+            for name, one in law_states(self.law).items()
         }
 
     @property

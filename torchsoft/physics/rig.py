@@ -80,8 +80,8 @@ class Rig(Shown, Graph):
                 f"{self.matched_value(name):.4g}}})"
             )
         if found is None:
-            mine = {own: other for other, own in self.names.items()}
-            names = dict.fromkeys(mine.get(own, own) for own, _ in self.named_parameters())
+            file_names = {key: other for other, key in self.names.items()}
+            names = dict.fromkeys(file_names.get(key, key) for key, _ in self.named_parameters())
             names |= {short: full for short, full in self.short.items() if full in names}
             raise ValueError(
                 f"`{name}` is not a parameter of this rig; {suggestion(name, names, 'known:')}"
@@ -106,7 +106,7 @@ class Rig(Shown, Graph):
     @property
     def ordered(self) -> dict[str, str]:
         """Parameters that must not exceed another one, with the name of that one."""
-        names = {own: name for name, own in self.names.items()}
+        names = {key: name for name, key in self.names.items()}
         pairs = [
             [f"{k}.{one}" for one in m.ordered]
             for k, m in self.named_modules()
@@ -116,15 +116,15 @@ class Rig(Shown, Graph):
 
     def description(self) -> dict[str, Any]:
         """The numbers and laws of the rig as they are now, saved with a run."""
-        names, values = {own: name for name, own in self.names.items()}, dict[str, Any]()
-        for own, value in self.named_parameters():
-            if own.startswith("reference."):
+        names, values = {key: name for name, key in self.names.items()}, dict[str, Any]()
+        for key, value in self.named_parameters():
+            if key.startswith("reference."):
                 continue
-            owner, behind, last = own.partition(".parametrizations.")
+            owner, behind, last = key.partition(".parametrizations.")
             if behind:  # the value, not what it is made of
                 last = last.partition(".")[0]
-                own, value = f"{owner}.{last}", getattr(self.get_submodule(owner), last)
-            values[names.get(own, own)] = value.detach().tolist()
+                key, value = f"{owner}.{last}", getattr(self.get_submodule(owner), last)
+            values[names.get(key, key)] = value.detach().tolist()
         values |= {name: self.matched_value(name) for name in self.matched}
         return {
             "parameters": values,

@@ -105,14 +105,14 @@ def warn_of_moments(rig: Graph, y: Tensor, bodies: Starts) -> None:
 
 def moving(rig: Graph, y: Tensor, bodies: Starts) -> Tensor:
     """The state y (size,) with the bodies' rates as given."""
-    own = {}
+    velocities = {}
     for name, axes in rig.layout.free.items():
         given, rates = bodies.get(name, {}), list(RATES)
         if any(rate in given for rate in rates):
             values = [scalar(f"{name}.{rates[i]}", given.get(rates[i], 0.0)) for i in axes]
-            own["velocity", name] = torch.stack(values)
-    parts = {part: y[where] for part, where in rig.layout.slices.items()} | own
-    return torch.cat([parts[part] for part in rig.layout.slices]) if own else y
+            velocities["velocity", name] = torch.stack(values)
+    parts = {part: y[where] for part, where in rig.layout.slices.items()} | velocities
+    return torch.cat([parts[part] for part in rig.layout.slices]) if velocities else y
 
 
 def placed(rig: Graph, bodies: Starts, held: Mapping[str, Tensor]) -> Poses:
@@ -271,7 +271,7 @@ def upon(rig: Graph, pose: Mapping[str, Tensor], body: str) -> Tensor:
     """Height [m] at which the undeformed pads of a body, lowered from above, just touch: one step
     of Newton's method with a graph after those without. Raises `NoPlace` where they touch
     nothing."""
-    own = [key for key, one in rig.contacts.items() if rig.pads[one.pad].base == body]
+    contacts = [key for key, one in rig.contacts.items() if rig.pads[one.pad].base == body]
     at_rest = {name: torch.zeros_like(at) for name, at in pose.items()}
 
     def gap(y: Tensor) -> Tensor:
@@ -279,7 +279,7 @@ def upon(rig: Graph, pose: Mapping[str, Tensor], body: str) -> Tensor:
         at = {**pose, body: at_height(pose[body], y)}
         state = State({}, unstretched(rig, ()), at, {}, at_rest)
         deepest = []
-        for key in own:
+        for key in contacts:
             pad = rig.pads[rig.contacts[key].pad]
             undeformed = torch.zeros(pad.nodes, 2, dtype=torch.float64)
             deepest.append(rig.penetration(key, state, undeformed).max())
@@ -287,7 +287,7 @@ def upon(rig: Graph, pose: Mapping[str, Tensor], body: str) -> Tensor:
 
     y, left = pose[body][1].detach(), torch.tensor(torch.inf)
     with torch.no_grad():
-        for _ in range(DESCENTS if own else 0):
+        for _ in range(DESCENTS if contacts else 0):
             left = gap(y)
             y = y - left
     if not abs(float(left)) < 1e-9:

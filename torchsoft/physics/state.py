@@ -18,7 +18,7 @@ class OwnState(NamedTuple):
     start: str = ""
 
 
-def own_states(law: object) -> dict[str, OwnState]:
+def law_states(law: object) -> dict[str, OwnState]:
     """States that a law has of its own, by name; most have none."""
     return dict(getattr(law, "states", {}))
 
@@ -32,7 +32,7 @@ def ages(law: object) -> bool:
 def begin_states(law: object, shape: Sequence[int]) -> Tensor:
     """States (*shape, states) that a law begins with."""
     zero = torch.zeros((), dtype=torch.float64)
-    begin = [getattr(law, one.start) if one.start else zero for one in own_states(law).values()]
+    begin = [getattr(law, one.start) if one.start else zero for one in law_states(law).values()]
     return torch.stack(begin or [zero])[: len(begin)].expand(*shape, len(begin))
 
 
@@ -64,7 +64,7 @@ class StateBlock(NamedTuple):
         return tuple(dict.fromkeys(unit for count, unit in self.groups if count))
 
 
-def own_blocks(
+def law_blocks(
     field: str, name: str, units: Sequence[str], shape: tuple[int, ...] = ()
 ) -> list[StateBlock]:
     """States (states, *shape) of a law, of these units, each judged by itself; none without."""
@@ -141,8 +141,8 @@ class Layout:
 
     def components(self, *parts: str) -> list[int]:
         """Components of some parts of the state."""
-        own = (s for (part, _), s in self.slices.items() if part in parts)
-        return [i for s in own for i in range(s.start, s.stop)]
+        slices = (s for (part, _), s in self.slices.items() if part in parts)
+        return [i for s in slices for i in range(s.start, s.stop)]
 
     @property
     def rigid(self) -> list[int]:
@@ -157,8 +157,8 @@ class Layout:
 
     def without_surfaces(self) -> "Layout":
         """The layout of the components `measured` alone."""
-        own = ("pose", "velocity", "control")
-        return Layout(self.free, [one for one in self.blocks.values() if one.field in own])
+        fields = ("pose", "velocity", "control")
+        return Layout(self.free, [one for one in self.blocks.values() if one.field in fields])
 
     def check(self, y: Tensor) -> None:
         """Raises `ValueError` for another length or dtype than float64."""
@@ -176,16 +176,16 @@ class Layout:
         self.check(y)
         parts: dict[str, dict[str, Tensor]] = {name: {} for name in State._fields}
         for (part, name), block in self.blocks.items():
-            own = y[..., self.slices[part, name]]
-            parts[part][name] = own.reshape((*y.shape[:-1], *block.shape))
+            values = y[..., self.slices[part, name]]
+            parts[part][name] = values.reshape((*y.shape[:-1], *block.shape))
         for part, others in (("pose", held), ("velocity", held_rates)):
             for name, axes in self.free.items():
-                own, rows = (
+                values, rows = (
                     parts[part][name],
                     list(others[name].expand(*y.shape[:-1], 3).unbind(-1)),
                 )
                 for i, axis in enumerate(axes):
-                    rows[axis] = own[..., i]
+                    rows[axis] = values[..., i]
                 parts[part][name] = torch.stack(rows, -1)
         return State(**parts)
 

@@ -127,14 +127,14 @@ def carried(rig: Graph, name: str, state: State, known: dict[str, Tensor] | None
     nearby, and leaves its own there.
     """
     pad = rig.pads[name]
-    own = rig.contacts_of(name)
+    contacts = rig.contacts_of(name)
     batch = next(iter(state.pose.values())).shape[:-1]
     undeformed = torch.zeros(*batch, pad.nodes, 2, dtype=torch.float64)
     found, left = undeformed, 0.0
-    if own and pad.nodal:
+    if contacts and pad.nodal:
         found, left = displaced(rig, name, state, batch, {} if known is None else known)
-    elif own:
-        law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
+    elif contacts:
+        law = lambda u: rig.point_forces(contacts, state, u, torch.zeros_like(u))
         found, left = contact_forces(
             pad.compliance(), pad.interpolation, undeformed, law, RESIDUAL, SETTLING
         )
@@ -153,10 +153,10 @@ def displaced(
 ) -> tuple[Tensor, float]:
     """Displacements (*batch, nodes, 2) [m] of a nodal pad in balance with its contacts, in a batch
     of copies of one state, and the largest step that is left."""
-    pad, own, first = rig.pads[name], rig.contacts_of(name), (0,) * len(batch)
+    pad, contacts, first = rig.pads[name], rig.contacts_of(name), (0,) * len(batch)
 
     def law(u: Tensor, state: State, part: float = 1.0) -> Tensor:
-        return part * rig.point_forces(own, state, u, torch.zeros_like(u))
+        return part * rig.point_forces(contacts, state, u, torch.zeros_like(u))
 
     alone = lambda values: {key: value[first].detach() for key, value in values.items()}
     one = State({}, alone(state.stretch), alone(state.pose), {}, alone(state.velocity))
@@ -278,7 +278,7 @@ def resting(
     given = *pose.values(), *(pushed or {}).values(), followed
     names = tuple(k for k in rig.actuators if actuators is None or k in actuators)
     key = values_of(rig, *given), *pose, repr(sought), *(pushed or ()), names, residual
-    kept = next((one for own, one in [*_balances] if own == key), None) if key[0] else None
+    kept = next((one for other, one in [*_balances] if other == key), None) if key[0] else None
     if kept and not torch.is_grad_enabled():
         return {name: at.clone() for name, at in kept.poses.items()}
     with torch.no_grad():
@@ -333,8 +333,8 @@ def resting(
             inverse = (V.mT[:, ~neutral] / S[~neutral]) @ U.mT[~neutral]
             found = poses(q + inverse @ (net[0] if torch.is_grad_enabled() else F))
             if key[0] and not kept:
-                own = {name: at.detach().clone() for name, at in found.items()}
-                _balances.append((key, Balanced(q, before, own)))
+                copies = {name: at.detach().clone() for name, at in found.items()}
+                _balances.append((key, Balanced(q, before, copies)))
             return found
         path.append((size, q))
         q = q + step

@@ -16,7 +16,7 @@ from torchsoft.physics.graph import Graph
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.pads import Taxels
 
-OWN = "torchsoft.", "torch.nn."
+PACKAGES = "torchsoft.", "torch.nn."
 """Packages whose modules say all of themselves."""
 
 HOOKS = "_forward_hooks", "_forward_pre_hooks", "_backward_hooks", "_backward_pre_hooks"
@@ -56,26 +56,26 @@ class Structure:
         children: dict[str, int | None] = {}
         self.modules.append(module)
         self.children.append(children)
-        own, kind = module.__dict__, type(module)
-        names, numbers, known = _traits(kind, tuple(own))
+        attributes, kind = module.__dict__, type(module)
+        names, numbers, known = _traits(kind, tuple(attributes))
         key = self._key
         key.append((kind, kind.forward, names, *[getattr(kind, name) for name in numbers]))
-        if not known or any(map(own.get, HOOKS)):
+        if not known or any(map(attributes.get, HOOKS)):
             self.known = False
         try:
             for name in names:
-                value = own[name]
+                value = attributes[name]
                 key.append(value if type(value) in PLAIN else described(value))
-            for name, value in own["_buffers"].items():
+            for name, value in attributes["_buffers"].items():
                 key.append((name, None if value is None else described(value)))
         except Unknown:
             self.known = False
-        for name, value in own["_parameters"].items():
+        for name, value in attributes["_parameters"].items():
             key.append(name)
             key.append(None if value is None else value.shape)
             if value is not None:
                 self.parameters.append(value)
-        for name, child in own["_modules"].items():
+        for name, child in attributes["_modules"].items():
             if name not in _idle(kind):
                 children[name] = None if child is None else self._visit(child)
         key.append(tuple(children.items()))
@@ -86,22 +86,22 @@ class Structure:
         comes first. Its buffers, lists and arrays are copies too where it is `apart`."""
         out: list[Any] = [type(module).__new__(type(module)) for module in self.modules]
         given = iter(values)
-        for module, own, children in zip(self.modules, out, self.children):
-            mine = own.__dict__
-            mine.update(module.__dict__)
+        for module, new, children in zip(self.modules, out, self.children):
+            attributes = new.__dict__
+            attributes.update(module.__dict__)
             if apart:
                 for name, value in module.__dict__.items():
                     if type(value) in (dict, list, np.ndarray):
-                        mine[name] = value.copy()
-                mine["_buffers"] = {
+                        attributes[name] = value.copy()
+                attributes["_buffers"] = {
                     name: None if buffer is None else buffer.detach().clone()
                     for name, buffer in module._buffers.items()
                 }
-            mine["_parameters"] = {
+            attributes["_parameters"] = {
                 name: None if value is None else next(given)
                 for name, value in module._parameters.items()
             }
-            mine["_modules"] = {
+            attributes["_modules"] = {
                 name: None if number is None else out[number] for name, number in children.items()
             }
         return out
@@ -117,13 +117,13 @@ def _idle(kind: type) -> frozenset[str]:
 
 
 @cache
-def _traits(kind: type, own: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
-    """Names of attributes, of its `own`, that decide something, names of the numbers of a class,
+def _traits(kind: type, keys: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...], bool]:
+    """Names of attributes, among `keys`, that decide something, names of the numbers of a class,
     and whether its objects say all of themselves."""
     bases = [base for base in kind.__mro__ if base not in (nn.Module, object)]
     numbers = {k: 0 for base in bases for k, v in vars(base).items() if isinstance(v, int | float)}
-    names = tuple(name for name in own if name[0] != "_" and name not in _idle(kind))
-    return names, tuple(numbers), kind.__module__.startswith(OWN)
+    names = tuple(name for name in keys if name[0] != "_" and name not in _idle(kind))
+    return names, tuple(numbers), kind.__module__.startswith(PACKAGES)
 
 
 def described(value: Any) -> Any:
@@ -169,10 +169,11 @@ def copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:
     others in their place, which other threads must not meet."""
     if id(module) not in known:
         out = known[id(module)] = module.__class__.__new__(module.__class__)
-        mine = out.__dict__
-        mine.update(module.__dict__)
-        mine["_parameters"], mine["_buffers"] = dict(module._parameters), dict(module._buffers)
-        mine["_modules"] = {
+        attributes = out.__dict__
+        attributes.update(module.__dict__)
+        attributes["_parameters"] = dict(module._parameters)
+        attributes["_buffers"] = dict(module._buffers)
+        attributes["_modules"] = {
             k: m if m is None else copied(m, known) for k, m in module._modules.items()
         }
     return known[id(module)]

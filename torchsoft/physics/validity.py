@@ -103,7 +103,7 @@ def check_values(rig: Any) -> None:
     """Raises `ValueError` as `check_numbers` does for all parts of the rig, for parameters that are
     not physical together, and for a material without a `chain`."""
     check_place()
-    check_numbers(rig, {own: other for other, own in rig.names.items()})
+    check_numbers(rig, {key: other for other, key in rig.names.items()})
     for name, pad in rig.pads.items():
         check_chain(name, pad.material)
     for owner, module in rig.named_modules():

@@ -14,7 +14,7 @@ from torchsoft.display import suggestion
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.plan.knots import Array, Bounds, Moves, Range
-from torchsoft.solve.batch import Batch, own_values, simulate_batch
+from torchsoft.solve.batch import Batch, run_values, simulate_batch
 from torchsoft.solve.simulate import Initial, Start, started
 from torchsoft.solve.trajectory import Trajectory
 from torchsoft.tables import Table
@@ -317,7 +317,7 @@ class Evaluator:
             return [Initial(row, self.variables.moves.given) for row in rows]
         if self.variables.shapes:
             return [y0] * self.draws
-        values = [own_values(self.rig, self.over, i) for i in range(self.draws)]
+        values = [run_values(self.rig, self.over, i) for i in range(self.draws)]
         return [started(self.rig, y0, "none", values=one) for one in values]
 
     def _planned(self, z: Tensor, start: Initial | Start) -> Initial | Start:

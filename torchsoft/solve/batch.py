@@ -190,9 +190,9 @@ def simulate_batch(
 
     def work(i: int) -> Solved | Trajectory | Exception:
         try:
-            own = own_values(runs[i]["rig"], parameters or {}, i)
+            values = run_values(runs[i]["rig"], parameters or {}, i)
             structure = structures.get(id(runs[i]["rig"]))
-            task = prepare(**runs[i], structure=structure, values=own, **options)
+            task = prepare(**runs[i], structure=structure, values=values, **options)
             solved = run(task, budget, explained=False)
             return Trajectory.of(solved) if solved.segments is None else solved
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
@@ -293,7 +293,7 @@ def _arguments(
     ]
 
 
-def own_values(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> dict[int, Tensor]:
+def run_values(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> dict[int, Tensor]:
     """Row i of the parameters, by the id of the rig's own that they take the place of."""
     values: dict[int, Tensor] = {}
     for name, rows in parameters.items():

@@ -15,7 +15,7 @@ from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, standing, with_condensed_pads
-from torchsoft.solve.steps import UNITS, own_units
+from torchsoft.solve.steps import UNITS, rig_units
 from torchsoft.solve.trajectory import Trajectory
 
 # Checks of a finished run: whether its energies balance, and whether its pads are pressed beyond
@@ -112,7 +112,7 @@ def doubts(trajectory: Trajectory, rig: Rig, differentiated: bool = False) -> di
     most = max((float(np.sqrt((N**2 + T**2).max())) for N, T in pairs), default=0.0)
     atol = run.step_choice.get("atol", 0.0)
     if 0 < RESOLVED * most < atol * UNITS["force"]:
-        unit = own_units(rig)["force"]
+        unit = rig_units(rig)["force"]
         if RESOLVED * most < (off := atol * unit):
             better = 0.1 * RESOLVED * most
             remedy = (
@@ -307,14 +307,14 @@ def instability(rig: Rig, run: Trajectory) -> str:
             continue
     else:
         return ""
-    still = Reference(**{name: Profile([0.0], [float(run[name][k])]) for name in rig.signals})
-    values, moves = modes(soft, y, still)
+    constant = Reference(**{name: Profile([0.0], [float(run[name][k])]) for name in rig.signals})
+    values, moves = modes(soft, y, constant)
     free = Graph(
         bodies=rig.bodies, pads=soft.pads, contacts=rig.contacts, reference=rig.reference,
         gravity=float(rig.gravity), symbols=rig.symbols,
     )  # fmt: skip
     passive = y[: free.layout.size]  # without states of actuators, which come last
-    alone = float(modes(free, passive, still).values.real.amax()) if len(values) else 0.0
+    alone = float(modes(free, passive, constant).values.real.amax()) if len(values) else 0.0
     if not len(values) or float(values[0].real) <= LOOPS * max(alone, NEUTRAL):
         return ""
     leading = complex(values[0])

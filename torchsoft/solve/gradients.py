@@ -183,20 +183,20 @@ def run_adjoint(
                 f"the cotangent of output {np.argwhere(~np.isfinite(bar))[0][0]} is not finite"
             )
     sizes = sizes_of(stepper.layout, run.out.y)
-    own = float((np.abs(rows) @ sizes).sum())
-    own += float(np.abs(forces).sum()) * float(np.abs(run.out.recorded).max(initial=SMALL))
+    input_size = float((np.abs(rows) @ sizes).sum())
+    input_size += float(np.abs(forces).sum()) * float(np.abs(run.out.recorded).max(initial=SMALL))
     carried, p_bar = np.zeros(size), np.zeros(len(stepper.parameters.p))
     segments, outputs_bar = run.segments or [], np.zeros((len(t), *run.out.signals.shape[1:]))
     signals_bar = [np.zeros_like(segment.stages) for segment in segments]
     room = stepper.parameters.model.take(stepper.parameters.numbers)
-    for segment, own_bar in zip(reversed(segments), reversed(signals_bar)):
+    for segment, signal_bar in zip(reversed(segments), reversed(signals_bar)):
         plan, (tape, out_tape) = segment.plan, stepper.tapes(segment, room)
         failed, here = np.zeros(1, np.int64), segment.rows
         sweep = Backward(
             room.system, room.work, room.of("Directions", columns=1), tape,
             plan.h, segment.stages, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
             rows[here], forces[here], columned(outputs_bar[here]), carried[:, None], p_bar[:, None],
-            columned(own_bar), failed,
+            columned(signal_bar), failed,
         )  # fmt: skip
         with released_turn():
             call("backward", sweep)
@@ -204,9 +204,9 @@ def run_adjoint(
             time = stepper.origin + plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
     stepper.parameters.model.give(room)
-    if own > 0:
+    if input_size > 0:
         by_parameters = np.abs(p_bar * stepper.parameters.p.detach().numpy()).max(initial=0.0)
-        warn_of_amplified(max(np.abs(carried * sizes).max(), by_parameters) / own)
+        warn_of_amplified(max(np.abs(carried * sizes).max(), by_parameters) / input_size)
     parts = carried, p_bar, np.concatenate(signals_bar), outputs_bar
     return tuple(torch.from_numpy(part) for part in parts)  # pyright: ignore[reportReturnType]
 
@@ -250,15 +250,15 @@ def directions(value: Tensor, wrt: Sequence[Tensor]) -> Array:
         if wrt and value.requires_grad
         else ()
     )
-    if own := [k for k, part in enumerate(pulled) if part is not None and part.requires_grad]:
-        some = [pulled[k] for k in own]
+    if columns := [k for k, part in enumerate(pulled) if part is not None and part.requires_grad]:
+        some = [pulled[k] for k in columns]
 
         def pushed(one: Tensor) -> Tensor:
             (row,) = torch.autograd.grad(some, weights, [*one], retain_graph=True)
             return row
 
-        rows = torch.func.vmap(pushed)(torch.eye(len(own), dtype=torch.float64))
-        out[..., own] = rows.movedim(0, -1).numpy()
+        rows = torch.func.vmap(pushed)(torch.eye(len(columns), dtype=torch.float64))
+        out[..., columns] = rows.movedim(0, -1).numpy()
     return out
 
 
@@ -320,7 +320,7 @@ def iterate(task: Task, wrt: Sequence[Tensor], columns: list[int], sums: Sums) -
         yield Solved(task, out, None, (torch.from_numpy(kept), torch.from_numpy(forces)))
     stepper.parameters.model.give(room)
     rigid = [k for k, column in enumerate(columns) if column in set(stepper.layout.rigid)]
-    own = np.array([float(p.detach()) for p in wrt])
-    moved = np.abs(kept[:, rigid, : len(wrt)] * own).max((0, 2), initial=0.0)
+    values = np.array([float(p.detach()) for p in wrt])
+    moved = np.abs(kept[:, rigid, : len(wrt)] * values).max((0, 2), initial=0.0)
     sizes = sizes_of(stepper.layout, out.y)[[columns[k] for k in rigid]]
     warn_of_amplified(float((moved / sizes).max(initial=0.0)))

@@ -34,7 +34,7 @@ from torchsoft.physics.mesh.element import QUADRILATERAL
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import Actuator, weight
 from torchsoft.physics.shapes import Shape
-from torchsoft.physics.state import begin_states, own_states
+from torchsoft.physics.state import begin_states, law_states
 from torchsoft.physics.structure import copied, structure_of
 from torchsoft.physics.validity import tried
 from torchsoft.solve.kernel.arrays import LANES, MOTION, WRENCH
@@ -73,8 +73,8 @@ def as_law(
     called = _Called(function, **modules)
 
     def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-        own = {name: value for name, value in values.items() if name.split(".")[0] in modules}
-        return torch.func.functional_call(called, own, (x,))
+        chosen = {name: value for name, value in values.items() if name.split(".")[0] in modules}
+        return torch.func.functional_call(called, chosen, (x,))
 
     return law, dict(called.named_parameters())
 
@@ -218,7 +218,7 @@ def outputs_of(law: Callable[..., Any], x: Tensor) -> Tensor:
     """Outputs of a law of tensors, of an actuator or a shape."""
     if isinstance(law, Actuator):
         out = response_of(law, x)
-    elif own_states(law):
+    elif law_states(law):
         E, F_N, R, *_ = x.unbind(-1)
         out = slip_of(law, E, F_N, R, x[..., 3:-1], x[..., -1])
     else:
@@ -232,7 +232,7 @@ def tried_efforts(slip: Any, R: float) -> Tensor:
     length too, (samples, inputs) at which it is tried."""
     E, F_N = tried()
     x = torch.stack((E, F_N, torch.full_like(E, R)), -1)
-    if not own_states(slip):
+    if not law_states(slip):
         return x
     z = begin_states(slip, E.shape).detach()
     share = torch.linspace(0.5, 1.5, len(E), dtype=torch.float64)[:, None]
@@ -241,7 +241,7 @@ def tried_efforts(slip: Any, R: float) -> Tensor:
 
 def friction_fault(where: str, slip: Any, R: float) -> str:
     """`gradient_fault` of a slip law with the dashpot R [N.s/m]."""
-    inputs = ("the effort", "the normal force", "the dashpot", *own_states(slip), "the stage")
+    inputs = ("the effort", "the normal force", "the dashpot", *law_states(slip), "the stage")
     return gradient_fault(f"the slip law of `{where}`", slip, tried_efforts(slip, R), inputs)
 
 
@@ -304,7 +304,7 @@ def numbers_of(material: Material) -> Tensor:
 def reference_fault(reference: Reference, names: Sequence[str], t: Tensor) -> str:
     """`difference_fault` of the signals called `names`, in a run through the times t."""
     at = t[0] + (t[-1] - t[0]) * torch.tensor(SHARES, dtype=torch.float64)
-    return difference_fault("the reference", reference, lambda own: own(at, names))
+    return difference_fault("the reference", reference, lambda one: one(at, names))
 
 
 def response_of(actuator: Actuator, x: Tensor) -> tuple[Tensor, ...]:
@@ -351,7 +351,7 @@ def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]
 def contact_laws(law: Any, shape: Any) -> LawSet:
     """The laws of a contact of `law` on a body of `shape`."""
     _, parameters = as_law(interface_law, {"law": law, "shape": shape})
-    states = 1 + len(own_states(law.friction))
+    states = 1 + len(law_states(law.friction))
     inputs, rows = MOTION + states + 2, WRENCH + states + 2
     return LawSet(
         compiled_law(parameters, distance_law, inputs, 0, 0, shape=shape),
@@ -377,7 +377,7 @@ def motion_law() -> Law:
 def weight_law() -> Law:
     """The law of a weight; its parameters are mass and gravity."""
     numbers = torch.tensor([0.5, 9.81], dtype=torch.float64)
-    law = lambda _, own: weight(*own["numbers"].unbind())[None]
+    law = lambda _, values: weight(*values["numbers"].unbind())[None]
     return compile_law(law, torch.zeros(0, dtype=torch.float64), {"numbers": numbers})
 
 
@@ -402,8 +402,8 @@ def element_law(
 
     Raises `UnknownOperation` for an energy that cannot be compiled, with the pad's name.
     """
-    own = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
-    parameters: dict[str, Tensor] = {f"material.{key}": value for key, value in own.items()}
+    numbers = dict(material.named_parameters()) if isinstance(material, Hyperelastic) else {}
+    parameters: dict[str, Tensor] = {f"material.{key}": value for key, value in numbers.items()}
     parameters["factors.values"] = factors
     corners = QUADRILATERAL.dofs * fields
     try:

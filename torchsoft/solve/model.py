@@ -225,12 +225,12 @@ def compiled_laws(
         if (key := (id(law), id(shape))) not in known:
             check_shape(contact.body, shape)
             slip, stiffness = law.friction, law.R_t.item() + NOMINAL * law.K_t.item()
-            own = structure_of(law) is None or not type(slip).__module__.startswith("torchsoft.")
-            if own:
+            opaque = structure_of(law) is None or not type(slip).__module__.startswith("torchsoft.")
+            if opaque:
                 one, custom = torch.ones(()).double(), True
                 slip_rates(name, slip, one, one, stiffness)
             known[key] = contact_laws(matched[name], shapes.get(contact.body, shape))
-            if own:
+            if opaque:
                 faults += check_slip(name, slip, stiffness), friction_fault(name, slip, stiffness)
             if structure_of(shape) is None:
                 faults.append(shape_fault(contact.body, shape))
@@ -246,7 +246,7 @@ def named_places(
     """Places of the parameters by all of their names, and of what is made of them, from the first
     places of the tensors, by their id."""
     named = dict(rig.named_parameters(remove_duplicate=False))
-    named |= {name: named[own] for name, own in rig.names.items() if own in named}
+    named |= {name: named[key] for name, key in rig.names.items() if key in named}
     named |= {f"{kind} of {part}": value for (kind, part), value in made.items()}
     return {
         name: slice(at := firsts[id(value)], at + value.numel()) for name, value in named.items()
@@ -271,8 +271,8 @@ def derived(modules: Sequence[Any]) -> list[tuple[int, str, float, float]]:
     """Numbers with a range that are made of parameters: of which module, names and ranges."""
     out = []
     for i, module in enumerate(modules):
-        own = {name for name, value in module._parameters.items() if value is not None}
-        for name in sorted(quantities(type(module)).keys() - own):
+        stored = {name for name, value in module._parameters.items() if value is not None}
+        for name in sorted(quantities(type(module)).keys() - stored):
             if isinstance(getattr(module, name, None), Tensor):
                 known = quantity_of(module, name)
                 assert known is not None

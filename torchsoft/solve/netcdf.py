@@ -86,8 +86,8 @@ def arrays(about: Mapping[str, Any]) -> Iterator[Stored]:
         name, dims = f"displacement_{key}", f"time {key}_node axis"
         yield Stored("displacement", key, name, dims, "m", meaning)
         for part, (dims, unit, meaning) in MESH.items():
-            own = dims.format(key, key), unit, meaning.format(key)
-            yield Stored(part, key, f"mesh_{part}_{key}", *own)
+            rest = dims.format(key, key), unit, meaning.format(key)
+            yield Stored(part, key, f"mesh_{part}_{key}", *rest)
     for key in about["outlined"]:
         meaning = f"outline of {key} about its centre"
         yield Stored("outline", key, f"outline_{key}", f"{key}_outline axis", "m", meaning)
@@ -221,7 +221,7 @@ def assembled(
     t: Tensor, about: dict[str, Any], found: Mapping[tuple[str, str], Tensor]
 ) -> Trajectory:
     """The run of times and arrays, and of what is said about them."""
-    of = lambda field: {key: x for (own, key), x in found.items() if own == field}
+    of = lambda field: {key: x for (part, key), x in found.items() if part == field}
     stats, plain, _, states, units, _, wrt, _, _ = (about.pop(name) for name in ABOUT)
     if not all(isinstance(x, int | float) for x in stats.values()):
         raise TypeError("stats")

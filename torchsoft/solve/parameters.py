@@ -21,7 +21,7 @@ from torchsoft.physics.validity import check_place, check_values, ordinary
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.model import model_of
 from torchsoft.solve.rig_arrays import computed, prepared
-from torchsoft.solve.steps import Followed, own_units
+from torchsoft.solve.steps import Followed, rig_units
 
 
 @contextmanager
@@ -40,7 +40,7 @@ class Parameters:
     in the order in which the kernels read it, `numbers` without its graph, which it has where it is
     to be `differentiable`. rig: a copy of the rig with these parameters; model: what its structure
     determines; reference: that of the run, a copy of it in that case; units: of `atol`
-    (`own_units`).
+    (`rig_units`).
 
     Raises the `ValueError`s of a rig that cannot be run.
     """
@@ -62,9 +62,9 @@ class Parameters:
         apart = independent() if differentiable else nullcontext()
         with torch.inference_mode(False), torch.set_grad_enabled(differentiable), apart:
             theta, copies = taken(structure.parameters, given, differentiable)
-            own = [copies[id(x)] for x in structure.parameters]
-            self.model = model = model_of(structure, own)
-            modules = model.structure.copy(own, apart=False)
+            tensors = [copies[id(x)] for x in structure.parameters]
+            self.model = model = model_of(structure, tensors)
+            modules = model.structure.copy(tensors, apart=False)
             self.rig: Rig = modules[0]
             touched = lambda one: not values.keys().isdisjoint(map(id, one.parameters()))
             change = lambda one: differentiable or (values and touched(one))
@@ -89,7 +89,7 @@ class Parameters:
             check_values(self.rig)
         made = computed(self.rig, *prepared(self.rig)).values()
         self.vector = torch.cat([theta, *(x.double().reshape(-1) for x in made)])
-        self.p, self.units = self.vector[model.index], own_units(self.rig, model.smallest)
+        self.p, self.units = self.vector[model.index], rig_units(self.rig, model.smallest)
         self.numbers = self.p.detach().numpy()
         if not np.isfinite(self.numbers).all():
             raise ValueError(
@@ -173,7 +173,7 @@ def copy_of(
     `values` in the place of some. Signals that are not this package's are kept as they are."""
     foreign = [one for one in reference.signals.values() if not polynomial(one)]
     known: dict[int, nn.Module] = {id(one): one for one in foreign}
-    if reference.own_way:
+    if reference.overridden:
         return reference
     out = copied(reference, known)
     for one in known.values():
@@ -181,6 +181,6 @@ def copy_of(
             for name, x in one._parameters.items():
                 if x is not None and id(x) not in copies:
                     copies[id(x)] = values.get(id(x), x).clone()
-                own: dict[str, Any] = one._parameters
-                own[name] = x if x is None else copies[id(x)]
+                parameters: dict[str, Any] = one._parameters
+                parameters[name] = x if x is None else copies[id(x)]
     return out  # pyright: ignore[reportReturnType]

@@ -84,8 +84,8 @@ def computed(
             out["factors", name] = pad.factors()
             out["density", name] = material.rho * material.depth
         else:
-            own = torch.stack((1 / (pad.E * material.depth), material.nu))
-            out["chain", name] = torch.cat((*pad.chain(), own))
+            elasticity = torch.stack((1 / (pad.E * material.depth), material.nu))
+            out["chain", name] = torch.cat((*pad.chain(), elasticity))
     for name, law in laws.items():
         if law is not rig.contacts[name].law:
             out |= {(f"law of {name}", key): x for key, x in law.named_parameters()}
@@ -126,8 +126,8 @@ def arrays_of(rig: Rig, at: At, laws: Laws) -> tuple[Any, ...]:
 def starts(at: At, *kinds: str) -> list[int]:
     """Where the parts of some kinds, which are next to each other, start, and where the last one
     ends."""
-    own = [one for (kind, _), one in at.items() if kind in kinds]
-    return [*(one.start for one in own), own[-1].stop if own else 0]
+    slices = [one for (kind, _), one in at.items() if kind in kinds]
+    return [*(one.start for one in slices), slices[-1].stop if slices else 0]
 
 
 def first_state(rig: Rig, part: str) -> int:
@@ -215,7 +215,7 @@ def back_arrays(pads: Sequence[Pad]) -> Backs:
         Backs, start=np.cumsum([0, *(len(x) for x, _ in backs)]),
         box=[np.stack((x.min(0), x.max(0)), 1).ravel() for x in every],
         X=joined((x for x, _ in backs), 2),
-        bonded=joined(np.append(own, False) for _, own in backs),
+        bonded=joined(np.append(bonded, False) for _, bonded in backs),
     )  # fmt: skip
 
 
@@ -241,8 +241,8 @@ def nodal_arrays(rig: Rig, at: At, laws: Laws) -> Nodal:
     dofs = [2 * pad.fields * pad.nodes if pad.nodal else 0 for pad in pads]
     band = [bandwidth(field_dofs(pad)) if pad.nodal else 0 for pad in pads]
     elements = [-(-len(pad.corners) // LANES) * LANES if pad.nodal else 0 for pad in pads]
-    own = [laws.elements[name][0] if pad.nodal else None for name, pad in rig.pads.items()]
-    address = lambda kind: [getattr(law, kind, 0) for law in own]
+    element_laws = [laws.elements[name][0] if pad.nodal else None for name, pad in rig.pads.items()]
+    address = lambda kind: [getattr(law, kind, 0) for law in element_laws]
     parameters = [at.get(("element", name), none) for name in rig.pads]
     surface = [
         np.full(2 * len(pad.mesh.surface), -1)
@@ -302,17 +302,17 @@ def contact_arrays(
 ) -> Contacts:
     """`free` (coordinates,) numbers the free coordinates; `base` (pads,) are the first coordinates
     of the pads' bases."""
-    contacts, own = rig.contacts.values(), list(laws.values())
+    contacts, law_sets = rig.contacts.values(), list(laws.values())
     shapes, anywhere = [rig.shape_of(name) for name in rig.contacts], (-np.inf, np.inf) * 2
     limits = [anywhere if one.may_leave else rig.pads[one.pad].space.T.ravel() for one in contacts]
     owners = [list(rig.pads).index(contact.pad) for contact in contacts]
     body = np.array([3 * list(rig.bodies).index(contact.body) for contact in contacts], np.int64)
     both = np.stack((body, base[owners]), 1)[..., None] + np.arange(3)
     coordinate = both.reshape(-1, 6)
-    address = lambda law, kind: [getattr(getattr(one, law), kind) for one in own]
+    address = lambda law, kind: [getattr(getattr(one, law), kind) for one in law_sets]
     return filled(
         Contacts, pad=owners, number=free[coordinate], coordinate=coordinate,
-        states=[one.states for one in own], distance=address("distance", "value"),
+        states=[one.states for one in law_sets], distance=address("distance", "value"),
         value=address("interface", "value"), linearise=address("interface", "linearise"),
         push=address("interface", "push"), pull=address("interface", "pull"),
         free_linearise=address("free", "linearise"), free_push=address("free", "push"),
@@ -348,7 +348,7 @@ def field_dofs(pad: Pad) -> Index:
     where they are bonded. A node's are side by side."""
     node, axis = np.divmod(pad.corners, 2)
     numbers = [2 * (pad.fields * node + k) + axis for k in range(pad.fields)]
-    return np.concatenate([np.where(pad.corners < 0, -1, own) for own in numbers], 1)
+    return np.concatenate([np.where(pad.corners < 0, -1, dofs) for dofs in numbers], 1)
 
 
 def lengthened(rows: Any, value: float) -> Any:

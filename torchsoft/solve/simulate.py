@@ -72,7 +72,7 @@ def simulate(
 
     Steps are chosen so that the error of each stays below rtol times the largest value so far plus
     atol, which counts nodal forces in N, lengths in mm, angles in rad, and in a light or small rig
-    forces by its weight, lengths by a tenth of its smallest body (`steps.own_units`); either alone
+    forces by its weight, lengths by a tenth of its smallest body (`steps.rig_units`); either alone
     brings the other, a tenth of rtol being atol. A motion is right long before its derivative is:
     rtol = 1e-3 holds positions to 1e-4 of their range and forces to 1 %; the default, `RTOL`, ten
     times that and most derivatives to 1 %. With `step` [s] they are equal ones between the times t

@@ -70,7 +70,7 @@ class ImplicitStepper:
     Steps are chosen by `rtol` and `atol`, or given: `step` [s] cuts every output interval into
     equal steps no longer than it, `knots` (n + 1,) [s] are the steps of another run. Tolerances
     hold the error that one step makes, in every part of the state (a pad's nodal forces, a
-    contact's stretches, a body's position, its angle), below atol units (`own_units`) plus rtol
+    contact's stretches, a body's position, its angle), below atol units (`rig_units`) plus rtol
     times the largest value so far; no step is longer than `longest` [s] or passes a knot of the
     reference, and with `landing` a step ends at every output.
 

@@ -195,7 +195,7 @@ THIN = 0.1
 """Unit of lengths over the size of the smallest body, at the most."""
 
 
-def own_units(rig: Rig, smallest: float | None = None) -> dict[str, float]:
+def rig_units(rig: Rig, smallest: float | None = None) -> dict[str, float]:
     """Units of `atol` for a rig: `UNITS`, or what its bodies weigh or would weigh, and a part of
     the `smallest` one [m], where they are less."""
     free = [one for one in rig.bodies.values() if "free" in one.freedom.values()]
@@ -217,9 +217,9 @@ class ErrorParts:
         layout, found = rig.layout, list[tuple[int, int, bool, str, str]]()
         self._poses = [here for (kind, _), here in layout.slices.items() if kind == "pose"]
         for block, here, unit in layout.groups():
-            rate, own = block.field in ("rates", "velocity"), QUANTITIES[block.field]
-            dimension = DIMENSIONS.get(unit, "own")
-            found.append((here.start, here.stop, rate, dimension, f"{own} `{block.name}`"))
+            rate, quantity = block.field in ("rates", "velocity"), QUANTITIES[block.field]
+            dimension = DIMENSIONS.get(unit, "start")
+            found.append((here.start, here.stop, rate, dimension, f"{quantity} `{block.name}`"))
         self._ends = [(begin, end) for begin, end, *_ in found]
         columns = list(zip(*found)) or [()] * 5
         self._whole = [np.array(numbers, np.int64) for numbers in columns[:3]]
@@ -234,7 +234,7 @@ class ErrorParts:
         size = [math.sqrt(off[a:b].dot(off[a:b])) for a, b in self._ends]
         unit = [units.get(one, 1.0) for one in self._dimensions]
         for i, one in enumerate(self._dimensions):
-            if one == "own":
+            if one == "start":
                 begin, end = self._ends[i]
                 unit[i] = math.sqrt(y0[begin:end].dot(y0[begin:end])) or 1.0
         first, last, rate = self._whole

@@ -46,7 +46,7 @@ def write(run: Trajectory, path: Path, times: Sequence[float] | None = None) -> 
             k: [] for k in ("pad", "strain", "stress", "von_mises")
         }
         for i, (name, pad) in enumerate(pads.items()):
-            own = pad.displacement(run.displacement[name][row].detach().numpy())
+            u = pad.displacement(run.displacement[name][row].detach().numpy())
             x, y, angle = (
                 (0.0, 0.0, 0.0) if pad.base is None
                 else run.state.pose[pad.base][row].detach().tolist()
@@ -54,17 +54,17 @@ def write(run: Trajectory, path: Path, times: Sequence[float] | None = None) -> 
             turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
             axes = turn @ pad.axes.numpy()
             points.append(pad.placed(pad.mesh.nodes) @ turn.T + [x, y])
-            moved.append(own @ axes.T)
-            strain = pad.strain(own)
-            stress, zero = pad.stress(own), np.zeros(len(strain))
+            moved.append(u @ axes.T)
+            strain = pad.strain(u)
+            stress, zero = pad.stress(u), np.zeros(len(strain))
             fields["pad"].append(np.full(len(strain), i))
-            for key, own_axes in (
+            for key, values in (
                 ("strain", tensors(strain[:, 0], strain[:, 1], zero, strain[:, 2])),
                 ("stress", tensors(*stress.T)),
             ):
                 world = np.eye(3)
                 world[:2, :2] = axes
-                turned = world @ own_axes.reshape(-1, 3, 3) @ world.T
+                turned = world @ values.reshape(-1, 3, 3) @ world.T
                 fields[key].append(turned.reshape(-1, 9))
             fields["von_mises"].append(von_mises(stress))
         flat = lambda parts: np.pad(np.concatenate(parts), ((0, 0), (0, 1)))

@@ -27,7 +27,7 @@ from torchsoft.sysid.prediction import Frozen
 from torchsoft.sysid.problem import DIFFERENCE, Problem, check_possible
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import EARLY
-from torchsoft.sysid.stages import LOOSE, USUAL, continued, refine_steps, scanned
+from torchsoft.sysid.stages import LOOSE, USUAL, continued, continued_on, refine_steps, scanned
 from torchsoft.sysid.unknowns import FAULTS, Unknown
 from torchsoft.tables import plain
 
@@ -41,7 +41,7 @@ are small beside the misfit."""
 FAINT = 0.05
 """Part of the misfit above the noise that a suspect explains by its score test to be in the first
 bracket, however large that is: far from the data score tests order suspects wrongly, and causes had
-0.16 and more."""
+0.16 and more. A refit that leaves as little, besides chance, may explain the misfit."""
 
 KEPT = 3
 """One in so many suspects goes on after a round, with so many times as many evaluations."""
@@ -51,6 +51,9 @@ COMPLETE, ROUGH = 20, 1e-3
 
 TIGHTENINGS = 2
 """Most times that a finalist goes on with a tenth of its tolerance."""
+
+UNLIKELY = 3.0
+"""Standard deviations of a sum of squares that count as chance."""
 
 COMPARABLE = 2 * EVIDENT
 """A finalist that leaves more than this beyond the best one is stopped: `EVIDENT`, and as much for
@@ -236,7 +239,7 @@ def search(
             dropped = (replace(tests[one.name], dropped=True) for one in bracket if one not in fits)
             yield from ((test, None) for test in dropped)
             explained = False
-            for one, refit in refits(fits, finest, bar):  # 3.
+            for one, refit in refits(fits, finest, linear, bar):  # 3.
                 test = linear.refit_test(one, refit, tests[one.name])
                 yield test, refit
                 explained = explained or bool(test.suspected and test.passed)
@@ -333,13 +336,13 @@ def carried_on(fit: Fit, evaluations: int) -> Fit:
 
 
 def refits(
-    fits: Mapping[Suspect, Fit], finest: float, bar: "tqdm[Any]"
+    fits: Mapping[Suspect, Fit], finest: float, linear: Linearised, bar: "tqdm[Any]"
 ) -> Iterator[tuple[Suspect, Fit]]:
     """The fits, completed, the one that leaves least first."""
     best = np.inf
     for one in sorted(fits, key=lambda one: fits[one].square):
         bar.set_description(plain(f"refit with {one.name} free"))
-        refit = completed(fits[one], finest, best + COMPARABLE)
+        refit = completed(fits[one], finest, best + COMPARABLE, linear)
         best = min(best, refit.square)
         yield one, refit
 
@@ -350,13 +353,24 @@ def on_loose_steps(end: Fit) -> Fit:
     return end if at.failed else end._replace(at=at)
 
 
-def completed(fit: Fit, finest: float, most: float) -> Fit:
+def completed(fit: Fit, finest: float, most: float, linear: Linearised) -> Fit:
     """The fit, continued until it converges, with ratios at a bound scanned over their whole range;
-    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares."""
+    on steps of the tolerance `finest` where it leaves at most `most` of the sum of squares. Where
+    it may explain the misfit, finer steps must not matter."""
     c = fit.problem.coordinates
     stuck = [one for one in c.within(fit.free & c.at_bound(fit.x)) if one.ratio_to]
     stage = replace(fit.stage, scanned=scanned(stuck), evaluations=COMPLETE, tolerance=ROUGH)
     end = continued(fit, stage) or fit
     if end.square > most:
         return end._replace(converged=False)
-    return refine_steps(end.by(finest), TIGHTENINGS if end.loss == "linear" else 0)
+    end = end.by(finest)
+    fresh = end.residuals(steps=finest)
+    end = end if fresh.failed else continued_on(end, fresh, "steps chosen anew")
+    tighten = end.loss == "linear" and may_explain(end, linear)
+    return refine_steps(end, TIGHTENINGS if tighten else 0)
+
+
+def may_explain(fit: Fit, linear: Linearised) -> bool:
+    """Whether a fit leaves little of the misfit above the noise, and what chance leaves."""
+    chance = UNLIKELY * (2 * linear.dof) ** 0.5
+    return fit.square - linear.dof <= FAINT * (linear.square - linear.dof) + chance

@@ -202,11 +202,12 @@ SENTENCES: dict[str, tuple[str, ...]] = {
         "That may be chance: {tested} assumptions were tested.",
     ),
     "cause": (
-        "The data contradict that {stated}: the sum of squares falls from {before:.4g} to "
-        "{left:.4g} with {cases}.",
+        "Of the assumptions tested, the data contradict that {stated}: the sum of squares falls "
+        "from {before:.4g} to {left:.4g} with {cases}.",
         "{estimate} would move by {shift:.2g} standard deviations; estimates under it: {under}.",
         "The refit with {unconverged} free has not converged, so it has no estimates.",
-        "Correct it, and identify again.",
+        "Check it, and correct it: what is not tested, such as a parameter that changes within a "
+        "recording, may look alike.",
         'To estimate it, add [unknowns."{unknown}"].',
     ),
     "causes": (

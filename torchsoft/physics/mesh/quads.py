@@ -139,11 +139,11 @@ class QuadMesh(FreeMesh):
     @cached_property
     def face(self) -> Index:
         """Numbers of the nodes along the face."""
-        mine = {frozenset(self.number[i] for i in side) for side in self.face_sides}
+        sides = {frozenset(self.number[i] for i in side) for side in self.face_sides}
         before = {
             int(b): int(a)
             for a, b in boundary(self.elements)
-            if frozenset((int(a), int(b))) in mine
+            if frozenset((int(a), int(b))) in sides
         }
         starts = before.keys() - before.values()
         if len(starts) != 1:

@@ -39,7 +39,7 @@ def stage_adjoint(
     transport.carry_source_states(rig, work, along, a, y_bar, p_bar, True)
     for pad in range(rig.pad_base.size):
         pads.assemble(rig, work, pad, y, a, work.Rv)
-        along.own_rate[: work.counts[pad]] = 0.0
+        along.touched_rate[: work.counts[pad]] = 0.0
         if recorded and nodal.inertial(rig, pad):
             nodal.carry_recorded(rig, work, along, pad, y_bar, p_bar, True)
         transport.carry_ends(rig, work, along, pad, a, y_bar, recorded, True)

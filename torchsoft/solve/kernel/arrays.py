@@ -373,7 +373,7 @@ SCRATCH: dict[str, dict[str, str]] = {
         "coordinates columns": "q V",
         "free columns": "r dV",  # of the bodies' equations and their velocities
         # of nodes: displacements u*, rates before the change of forces, of touched ones after it
-        "nodes axes columns": "u rate own_rate",
+        "nodes axes columns": "u rate touched_rate",
         "dofs columns": "free rate_of",  # the same of nodal pads' rates
         "axes columns": "base_rate",
         "points rows columns": "out",  # of a law's outputs

@@ -154,19 +154,19 @@ def whole_module() -> llvm.ModuleRef:
 def compiled_object(module: str, target: str) -> bytes:
     """The object file of a module for a level of processors."""
     triple, cpu, features = LEVELS[target]
-    own = llvm.parse_assembly(module)
-    own.triple = triple
+    parsed = llvm.parse_assembly(module)
+    parsed.triple = triple
     machine = llvm.Target.from_triple(triple).create_target_machine(
         cpu=cpu, features=features, opt=3, reloc="pic", codemodel="small"
     )
     options = llvm.create_pipeline_tuning_options(speed_level=3)
     options.loop_vectorization = options.slp_vectorization = True
     passes = llvm.create_pass_builder(machine, options)
-    passes.getModulePassManager().run(own, passes)
-    outside = {f.name for f in own.functions if f.is_declaration and f.name[:5] != "llvm."}
+    passes.getModulePassManager().run(parsed, passes)
+    outside = {f.name for f in parsed.functions if f.is_declaration and f.name[:5] != "llvm."}
     if outside - KNOWN:
         raise ValueError(f"a kernel needs {sorted(outside - KNOWN)}, which no library has")
-    return machine.emit_object(own)
+    return machine.emit_object(parsed)
 
 
 def main() -> None:

@@ -265,7 +265,7 @@ def push_rates(rig: Any, work: Any, along: Any, pad: int, a: float, X: Array) ->
             for j in range(n):
                 for q in range(2):
                     c = scale * row[2 * (work.touched[first + j] - first) + q]
-                    add(c, X[2 * j + q], along.own_rate[i, o])
+                    add(c, X[2 * j + q], along.touched_rate[i, o])
 
 
 @compiled
@@ -293,11 +293,11 @@ def push_state(
 @compiled
 def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: float) -> None:
     """Cotangents of the touched nodes' forces into the first column of work.X, from those of the
-    state and of the nodes' rates, along.own_rate."""
+    state and of the nodes' rates, along.touched_rate."""
     first, size = rig.pad_node_start[pad], size_of(rig, pad)
     chain, branches = rig.condensed_chain_at[pad], rig.condensed_branches[pad]
     rate_bar = along.by_rate[: AXES * work.counts[pad]]
-    put(along.own_rate[: work.counts[pad]], rate_bar)
+    put(along.touched_rate[: work.counts[pad]], rate_bar)
     for i in range(work.counts[pad]):
         for r in range(AXES):
             dof = AXES * (work.touched[first + i] - first) + r

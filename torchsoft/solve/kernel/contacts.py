@@ -153,8 +153,8 @@ def evaluate(rig: Any, work: Any, pad: int, y: Array, a: float) -> None:
         if separation(rig, work, k, work.x[k]) >= 0.0:
             continue
         fill(rig, work, k, y, a)
-        own = rig.p[bounds(rig.contact_p_start, rig.point_contact[k])]
-        call_value(rig.contact_value[rig.point_contact[k]], work.x[k], own, work.out[k])
+        p = rig.p[bounds(rig.contact_p_start, rig.point_contact[k])]
+        call_value(rig.contact_value[rig.point_contact[k]], work.x[k], p, work.out[k])
         press(rig, work, k)
         work.active[at + actives] = k
         actives += 1
@@ -179,8 +179,8 @@ def linearise(rig: Any, work: Any, pad: int, a: float, recorded: bool) -> None:
     for i in range(at, at + work.actives[pad]):
         k = work.active[i]
         c = rig.point_contact[k]
-        own = rig.p[bounds(rig.contact_p_start, c)]
-        call_linearise(rig.contact_linearise[c], work.x[k], own, work.out[k], work.J[k])
+        p = rig.p[bounds(rig.contact_p_start, c)]
+        call_linearise(rig.contact_linearise[c], work.x[k], p, work.out[k], work.J[k])
     for c in range(rig.contact_pad.size):
         if rig.contact_pad[c] != pad:
             continue
@@ -193,9 +193,9 @@ def linearise(rig: Any, work: Any, pad: int, a: float, recorded: bool) -> None:
     for i in range(at, at + work.actives[pad]):
         k = work.active[i]
         c = rig.point_contact[k]
-        columns, stage, own = MOTION + rig.contact_states[c], work.by_stage[c], work.J[k]
+        columns, stage, slopes = MOTION + rig.contact_states[c], work.by_stage[c], work.J[k]
         for o in range(outputs(rig, c, recorded)):
-            J, H = own[o * columns : o * columns + MOTION], work.H[i, o]
+            J, H = slopes[o * columns : o * columns + MOTION], work.H[i, o]
             H[0], H[1] = J[5] + a * J[0], J[6] + a * J[1]
             combine(J, stage, H[2:])
 
@@ -368,8 +368,8 @@ def out_of_contact(rig: Any, work: Any, k: int, y: Array, a: float) -> None:
     for j in range(n):
         x[j] = y[state_at(rig, k, j)]
     x[n], x[n + 1] = rig.point_weight[k], a
-    own = rig.p[bounds(rig.contact_p_start, c)]
-    call_linearise(rig.contact_free_linearise[c], x, own, work.decay, work.decay_J)
+    p = rig.p[bounds(rig.contact_p_start, c)]
+    call_linearise(rig.contact_free_linearise[c], x, p, work.decay, work.decay_J)
 
 
 @compiled

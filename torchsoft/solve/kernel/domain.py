@@ -62,7 +62,7 @@ def reaches_base(rig: Any, work: Any, c: int) -> bool:
     """Whether a body overlaps a bonded side under the pad's face: its distance from a point of the
     side is also how far the search along the side may go on."""
     pad, x = rig.contact_pad[c], work.probe
-    own = rig.p[bounds(rig.contact_p_start, c)]
+    p = rig.p[bounds(rig.contact_p_start, c)]
     least = LEAST_WAY * rig.contact_inner[c, 2]
     for j in range(2, 5):
         x[j] = work.relative[c, j - 2]
@@ -83,7 +83,7 @@ def reaches_base(rig: Any, work: Any, c: int) -> bool:
         way, end = max(along - size, 0.0), min(along + size, length)
         while way <= end:
             x[0], x[1] = ax + way * tx, ay + way * ty
-            call_value(rig.contact_distance[c], x, own, work.phi)
+            call_value(rig.contact_distance[c], x, p, work.phi)
             if work.phi[0] < 0.0:
                 return True
             way += work.phi[0] if work.phi[0] > least else least

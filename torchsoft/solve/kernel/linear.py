@@ -56,12 +56,12 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
                 A[k, j], A[p, j] = A[p, j], A[k, j]
             for j in range(m):
                 b[k, j], b[p, j] = b[p, j], b[k, j]
-        inverse, own, right = 1.0 / A[k, k], A[k, k + 1 : n], b[k, :m]
+        inverse, pivot, right = 1.0 / A[k, k], A[k, k + 1 : n], b[k, :m]
         for i in range(k + 1, n):
             factor = A[i, k] * inverse
             if factor != 0.0:
                 row, other = A[i, k + 1 : n], b[i, :m]
-                add(-factor, own, row)
+                add(-factor, pivot, row)
                 add(-factor, right, other)
     for k in range(n - 1, -1, -1):
         inverse, right = 1.0 / A[k, k], b[k, :m]

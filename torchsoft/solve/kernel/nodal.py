@@ -112,12 +112,12 @@ def evaluate(rig: Any, work: Any, pad: int, y: Array, a: float) -> tuple[float, 
     balance under work.F_linear beyond rounding: the largest force [N], and the sum of squares
     [N2]."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
-    own = rig.p[element_parameters(rig, pad)]
+    p = rig.p[element_parameters(rig, pad)]
     work.internal[first:last], work.noise[first:last], work.power[pad] = 0.0, 0.0, 0.0
     (low, high), corners = groups(rig, pad), rig.nodal_dof.shape[1]
     for g in range(low, high):
         element_inputs(rig, work, pad, g, y, a)
-        call_value(rig.nodal_value[pad], work.element_x[g], own, work.element)
+        call_value(rig.nodal_value[pad], work.element_x[g], p, work.element)
         for lane in range(LANES):
             work.power[pad] += work.element[corners, lane]
             for c in range(corners):
@@ -173,13 +173,13 @@ def strained(rig: Any, work: Any, g: int, a: float) -> float:
 def linearise(rig: Any, work: Any, pad: int, y: Array, a: float, hold: float) -> bool:
     """Derivatives of the elements' forces, work.element_J, anew where they are strained by more
     than `hold`; whether any are."""
-    own, changed = rig.p[element_parameters(rig, pad)], False
+    p, changed = rig.p[element_parameters(rig, pad)], False
     (low, high), corners = groups(rig, pad), rig.nodal_dof.shape[1]
     for g in range(low, high):
         element_inputs(rig, work, pad, g, y, a)
         if work.held[pad] == 0.0 or not strained(rig, work, g, a) <= hold:
             call_linearise(
-                rig.nodal_linearise[pad], work.element_x[g], own, work.element, work.element_J[g]
+                rig.nodal_linearise[pad], work.element_x[g], p, work.element, work.element_J[g]
             )
             put(work.element_x[g, : 2 * corners], work.element_at[g])
             changed = True
@@ -453,7 +453,7 @@ def carry_elements(
     """Add the derivatives of the elements' forces, times a factor, to `out` (all dofs, columns): by
     displacements du (dofs, columns), by rates (all dofs, columns, or none) and by the parameters;
     or `back`."""
-    own, i0, (low, high) = element_parameters(rig, pad), rig.nodal_dof_start[pad], groups(rig, pad)
+    here, i0, (low, high) = element_parameters(rig, pad), rig.nodal_dof_start[pad], groups(rig, pad)
     corners, direction, force = rig.nodal_dof.shape[1], along.direction, along.element
     for g in range(low, high):
         J, dofs = work.element_J[g], rig.nodal_dof[g * LANES : (g + 1) * LANES]
@@ -467,15 +467,15 @@ def carry_elements(
                         if drate.shape[0] > 0:
                             by_rate = factor * J[c, corners + d, lane]
                             carry(by_rate, drate[i0 + dof], out[i0 + row], back)
-    direction = along.direction[: own.stop - own.start]
+    direction = along.direction[: here.stop - here.start]
     for k in range(dp.shape[1]):
         moved = back
         for j in range(direction.size):
-            direction[j] = dp[own.start + j, k]
+            direction[j] = dp[here.start + j, k]
             moved |= direction[j] != 0.0
         for g in range(low, high if moved else low):
             if not back:
-                call_push(rig.nodal_push[pad], work.element_x[g], rig.p[own], direction, force)
+                call_push(rig.nodal_push[pad], work.element_x[g], rig.p[here], direction, force)
             for lane in range(LANES):
                 for c in range(corners):
                     dof = rig.nodal_dof[g * LANES + lane, c]
@@ -484,7 +484,7 @@ def carry_elements(
                     elif dof >= 0:
                         out[i0 + dof, k] += factor * force[c, lane]
             if back:
-                call_pull(rig.nodal_pull[pad], work.element_x[g], rig.p[own], force, dp[own])
+                call_pull(rig.nodal_pull[pad], work.element_x[g], rig.p[here], force, dp[here])
 
 
 @compiled
@@ -530,7 +530,7 @@ def push(
 @compiled
 def push_rates(rig: Any, work: Any, along: Any, pad: int, X: Array, m: int) -> None:
     """Tangents of all nodes' rates, along.rate_of, under those of the nodal forces X, and
-    along.own_rate of the touched nodes, less along.rate."""
+    along.touched_rate of the touched nodes, less along.rate."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
     nodes = rig.pad_node_start[pad]
     along.base_rate[:] = 0.0
@@ -554,8 +554,8 @@ def push_rates(rig: Any, work: Any, along: Any, pad: int, X: Array, m: int) -> N
     for i in range(work.counts[pad]):
         node = work.touched[nodes + i]
         for o in range(AXES):
-            put(along.rate_of[first + rig.nodal_surface[AXES * node + o]], along.own_rate[i, o])
-            add(-1.0, along.rate[node, o], along.own_rate[i, o])
+            put(along.rate_of[first + rig.nodal_surface[AXES * node + o]], along.touched_rate[i, o])
+            add(-1.0, along.rate[node, o], along.touched_rate[i, o])
 
 
 @compiled
@@ -601,7 +601,7 @@ def carry_recorded(
 def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: float) -> None:
     """Cotangents of the touched nodes' forces into the first column of work.X, and of the base's
     velocity, from those of the state, of all nodes' rates and of the touched ones', along.rate_of
-    and along.own_rate."""
+    and along.touched_rate."""
     first, last, base = rig.nodal_dof_start[pad], rig.nodal_dof_start[pad + 1], rig.pad_base[pad]
     U, W, nodes, bar = (
         rig.pad_y_start[pad], rig.nodal_v_start[pad], rig.pad_node_start[pad], work.load_dof
@@ -613,7 +613,7 @@ def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: floa
     for i in range(work.counts[pad]):
         for r in range(AXES):
             dof = rig.nodal_surface[AXES * work.touched[nodes + i] + r]
-            bar[first + dof] += along.own_rate[i, r, 0]
+            bar[first + dof] += along.touched_rate[i, r, 0]
     if inertial(rig, pad):
         reaction = along.reaction[0]
         reaction[:] = 0.0

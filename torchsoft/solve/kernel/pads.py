@@ -156,11 +156,11 @@ def push(
 @compiled
 def push_rates(rig: Any, work: Any, along: Any, pad: int, a: float, columns: int) -> None:
     """Tangents of the nodal forces, in work.X, and of the touched nodes' rates less along.rate,
-    along.own_rate, from the solution in work.X and along.dV."""
+    along.touched_rate, from the solution in work.X and along.dV."""
     first, n = rig.pad_node_start[pad], work.counts[pad]
     X = work.X[2 * first : 2 * (first + n)]
     contacts.load_nodes(rig, work, pad, columns, along.dV)
-    along.own_rate[:n] = 0.0
+    along.touched_rate[:n] = 0.0
     if rig.pad_kind[pad] == CONDENSED:
         condensed.push_rates(rig, work, along, pad, a, X)
     else:
@@ -183,7 +183,7 @@ def push_state(
 @compiled
 def pull_forces(rig: Any, work: Any, along: Any, pad: int, y_bar: Array, a: float) -> None:
     """Cotangents of the touched nodes' forces into the first column of work.X, and of the base's
-    velocity, from those of the pad's state and of the touched nodes' rates, along.own_rate."""
+    velocity, from those of the pad's state and of the touched nodes' rates, along.touched_rate."""
     if rig.pad_kind[pad] == CONDENSED:
         condensed.pull_forces(rig, work, along, pad, y_bar, a)
     else:

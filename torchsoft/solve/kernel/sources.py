@@ -28,8 +28,8 @@ def effort(rig: Any, work: Any, i: int, a: float) -> float:
     for j in range(inputs.size):
         x[j] = work.ports[inputs[j]]
     x[inputs.size] = a
-    own = rig.p[bounds(rig.source_p_start, i)]
-    call_linearise(rig.source_linearise[i], x, own, work.effort, work.effort_J)
+    p = rig.p[bounds(rig.source_p_start, i)]
+    call_linearise(rig.source_linearise[i], x, p, work.effort, work.effort_J)
     return work.effort[0]
 
 

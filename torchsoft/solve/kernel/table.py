@@ -46,8 +46,8 @@ class Field(NamedTuple):
 
 def table(kind: Kind) -> Kind:
     """Make a table of a named tuple."""
-    own = {"packed": cached_property(_packed), "__getstate__": lambda self: None}
-    made: Any = type(kind.__name__, (kind,), own | {"__doc__": kind.__doc__})
+    attributes = {"packed": cached_property(_packed), "__getstate__": lambda self: None}
+    made: Any = type(kind.__name__, (kind,), attributes | {"__doc__": kind.__doc__})
     made.packed.__set_name__(made, "packed")
     made.__module__, made.__qualname__ = kind.__module__, kind.__qualname__
     made.__annotations__ = kind.__annotations__
@@ -67,10 +67,10 @@ def layout(kind: Any) -> tuple[Field, ...]:
         elif get_origin(hint) is not None:
             ndim = 1
         if ndim:
-            own = get_args(hint)[
+            dtype = get_args(hint)[
                 -1
             ]  # of NDArray, which is a generic array or, from numpy 2.5 on, named
-            hint = np.dtype(next(iter(get_args(own)), own))
+            hint = np.dtype(next(iter(get_args(dtype)), dtype))
         fields.append(Field(name, hint, ndim, word))
         word += 1 + ndim
     return tuple(fields)

@@ -19,21 +19,21 @@ from torchsoft.solve.kernel.table import Array
 
 @compiled
 def carry_parameters(
-    along: Any, push: int, pull: int, x: Array, p: Array, own: slice, dp: Array, out: Array,
+    along: Any, push: int, pull: int, x: Array, p: Array, here: slice, dp: Array, out: Array,
     back: bool,
 ) -> None:  # fmt: skip
-    """The outputs (rows, columns) of a law at x by its parameters, p[own]."""
+    """The outputs (rows, columns) of a law at x by its parameters, p[here]."""
     if back:
-        call_pull(pull, x, p[own], out, dp[own])
+        call_pull(pull, x, p[here], out, dp[here])
         return
-    direction, change = along.direction[: own.stop - own.start], along.change
+    direction, change = along.direction[: here.stop - here.start], along.change
     for k in range(dp.shape[1]):
         moved = False
         for j in range(direction.size):
-            direction[j] = dp[own.start + j, k]
+            direction[j] = dp[here.start + j, k]
             moved |= direction[j] != 0.0
         if moved:
-            call_push(push, x, p[own], direction, change)
+            call_push(push, x, p[here], direction, change)
             for o in range(out.shape[0]):
                 out[o, k] += change[o]
 
@@ -64,8 +64,8 @@ def carry_source_parameters(
     rig: Any, work: Any, along: Any, i: int, dp: Array, out: Array, back: bool
 ) -> None:
     """The same by its parameters."""
-    own, push, pull = bounds(rig.source_p_start, i), rig.source_push[i], rig.source_pull[i]
-    carry_parameters(along, push, pull, work.effort_x, rig.p, own, dp, out, back)
+    here, push, pull = bounds(rig.source_p_start, i), rig.source_push[i], rig.source_pull[i]
+    carry_parameters(along, push, pull, work.effort_x, rig.p, here, dp, out, back)
 
 
 @compiled
@@ -199,8 +199,8 @@ def carry_points(
             carry_force(rig, work, along, k, X, out, back)
         else:
             out[:] = 0.0
-        own, push, pull = bounds(rig.contact_p_start, c), rig.contact_push[c], rig.contact_pull[c]
-        carry_parameters(along, push, pull, work.x[k], rig.p, own, dp, out, back)
+        here, push, pull = bounds(rig.contact_p_start, c), rig.contact_push[c], rig.contact_pull[c]
+        carry_parameters(along, push, pull, work.x[k], rig.p, here, dp, out, back)
         carry_through(rig, work, along, k, work.S[i], along.u, False, along.q, out, back)
         carry_through(rig, work, along, k, work.H[i], along.rate, False, along.V, out, back)
         for o in range(out.shape[0]):
@@ -251,7 +251,7 @@ def carry_ends(
     rig: Any, work: Any, along: Any, pad: int, a: float, dy: Array, recorded: bool, back: bool
 ) -> None:
     """The states of a pad's touching points at the stage's end, or what is recorded, after the
-    change of velocities and of the touched nodes' rates, along.own_rate."""
+    change of velocities and of the touched nodes' rates, along.touched_rate."""
     at = rig.pad_point_start[pad]
     for i in range(at, at + work.actives[pad]):
         k = work.active[i]
@@ -260,13 +260,13 @@ def carry_ends(
         if back:
             along.out[k] = 0.0
         else:
-            carry_through(rig, work, along, k, H, along.own_rate, True, along.V, out, back)
+            carry_through(rig, work, along, k, H, along.touched_rate, True, along.V, out, back)
         if recorded:
             carry_recorded(rig, work, along, k, out, back)
         for j in range(0 if recorded else rig.contact_states[c]):
             carry(a, out[WRENCH + j], dy[contacts.state_at(rig, k, j)], back)
         if back:
-            carry_through(rig, work, along, k, H, along.own_rate, True, along.V, out, back)
+            carry_through(rig, work, along, k, H, along.touched_rate, True, along.V, out, back)
 
 
 @compiled
@@ -291,12 +291,12 @@ def carry_out_of_contact(
         out[:] = 0.0
         for o in range(n if back else 0):
             add(a, dy[contacts.state_at(rig, k, o)], out[o])
-        own, push, pull = (
+        here, push, pull = (
             bounds(rig.contact_p_start, c),
             rig.contact_free_push[c],
             rig.contact_free_pull[c],
         )
-        carry_parameters(along, push, pull, work.decay_x, rig.p, own, dp, out, back)
+        carry_parameters(along, push, pull, work.decay_x, rig.p, here, dp, out, back)
         for o in range(n):
             for q in range(n):
                 carry(work.decay_J[o * n + q], dy[contacts.state_at(rig, k, q)], out[o], back)
