@@ -113,6 +113,7 @@ def test_one_pad_is_judged_by_its_run(name):
 # the template, changed
 # ----------------------------------------------------------------------
 
+STONE = f"bodies.stone = {{x = 0.3e-3, y = 30e-3, theta = 0.0, shape = {BALL}}}"
 STEPS = "".join(f"{0.01 * i},{round(0.03 * i, 1)}\n" for i in range(250))
 
 
@@ -198,7 +199,7 @@ REPORTED = {
     "too heavy": ("bodies.disc.mass = 400.0",
         r"error: bodies\.disc\.start\.y: .*no rest under its weight of 3\.92e\+03 N is found"),
     # what will not go well
-    "overlap": (f"bodies.stone = {{x = 0.3e-3, y = 30e-3, theta = 0.0, shape = {BALL}}}",
+    "overlap": (STONE,
         r"error: bodies\.disc: it and bodies\.stone overlap by .* mm at t = 0 s"),
     "no room": ('motion.y_d.values = ["start", 40e-3]',
         r"warning: pads\.upper: .*it is compressed by 4\d%"),
