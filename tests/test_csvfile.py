@@ -200,9 +200,6 @@ def test_a_hundred_thousand_columns(tmp_path):
 BAD = {
     "both decimals": (COMMAS.replace("0,0015", "0.0015"), "decimal commas and decimal points"),
     "thousands": (COMMAS.replace("3,0", "3.000,0"), r"row 4, column `force`: '3\.000,0' is not a"),
-    "an unknown unit": (PLAIN.replace("t [s],force [N],x [mm]", "t,force,x\ns,N,furlong"),
-        r"row 1, column `x` cannot be in 'furlong'; it can be in m, cm, mm"),
-    "no unit": (PLAIN.replace("x [mm]", "x"), r"row 1, column `x` has no unit: write `x \[m\]`"),
 }  # fmt: skip
 
 

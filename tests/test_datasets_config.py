@@ -4,7 +4,6 @@ import copy
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +19,12 @@ from torchsoft.datasets.generate import points
 from torchsoft.datasets.rig_files import embedded
 from torchsoft.tables import InvalidTable
 
-PATH = Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml"
-SMOKE = embedded(tomllib.loads(PATH.read_text()), PATH.parent)
-E, MASS, MU, SPAN = (
-    "materials.rubber.E", "bodies.disc.mass", "laws.dry.friction.mu_k", {"low": 0.3, "high": 0.7},
-)  # fmt: skip
+SPAN = "{low = 0.3, high = 0.7}"
+
+
+def stroke(line: str) -> str:
+    """The kinds, with a line more in the first one."""
+    return KINDS.replace('name = "stroke"', f'name = "stroke"\n{line}')
 
 
 @pytest.fixture(scope="module")
@@ -33,60 +33,61 @@ def tree(tmp_path_factory):
     return embedded(tomllib.loads(written(folder, CONFIG + KINDS).read_text()), folder)
 
 
-def changed(tree: Any, place: tuple[str | int, ...], value: Any) -> Any:
-    """The configuration with another value in a place."""
-    inner = tree = copy.deepcopy(tree)
-    for key in place[:-1]:
-        inner = inner[key]
-    inner[place[-1]] = value
-    return tree
-
-
 MISTAKES = [
-    (("parameters", "materials.silicone.E"), SPAN,
+    (f'parameters."materials.silicone.E" = {SPAN}',
      r"`materials.silicone.E` is not in the rig file: materials has rubber"),
-    (("parameters", "motion.y_d.values_8"), SPAN, "it has motion.y_d.values_1 to _2"),
-    (("parameters", "materials.rubber.nu"), SPAN, r"nu.high = 0.7: impossible: .*nu.*0\.4999"),
-    (("parameters", MASS), {"choices": [0.3, -0.4]}, r"mass.choices.1 = -0.4: impossible"),
-    (("parameters", "bodies.disc.start.x"), {"mean": 0.06, "sd": 1e19},
+    (f'parameters."motion.y_d.values_8" = {SPAN}', "it has motion.y_d.values_1 to _2"),
+    (f'parameters."materials.rubber.nu" = {SPAN}', r"nu.high = 0.7: impossible: .*nu.*0\.4999"),
+    ('parameters."bodies.disc.mass" = {choices = [0.3, -0.4]}',
+     r"mass.choices.1 = -0.4: impossible"),
+    ('parameters."bodies.disc.start.x" = {mean = 0.06, sd = 1e19}',
      r"start.x: mean - 4 sd = -4e\+19: impossible"),
-    (("parameters", MASS), {"mean": 0.4}, r"parameters.bodies.disc.mass.sd is missing"),
-    (("parameters", MASS), {"mean": 0.4, "sd": 0.01, "low": 0.5}, "low = 0.5 should be below high"),
-    (("parameters", MASS), {"mean": 0.4, "sd": 0.01, "low": 1.5, "high": 1.6},
+    ('parameters."bodies.disc.mass" = {mean = 0.4}', "parameters.bodies.disc.mass.sd is missing"),
+    ('parameters."bodies.disc.mass" = {mean = 0.4, sd = 0.01, low = 0.5}',
+     "low = 0.5 should be below high"),
+    ('parameters."bodies.disc.mass" = {mean = 0.4, sd = 0.01, low = 1.5, high = 1.6}',
      "next to nothing of mean = 0.4"),
-    (("parameters", E), {"low": 9e5, "high": 8e5}, "rubber.E: low = 9"),
-    (("parameters", E, "low"), -1.0, "logarithmic range needs low > 0"),
-    (("parameters", MU), {"low": 0.75, "high": 0.9}, r"mu_k.high = 0.9: .* must not exceed mu_s"),
-    (("parameters", MU, "ratio_to"), "laws.dry.mu", "mu_k.ratio_to: `laws.dry.mu` is not in the"),
-    (("parameters", E), SPAN | {"ratio_to": MU}, "mu_k is a ratio itself"),
-    (("parameters", "pads.upper.elements_x"), SPAN, "the same in every trajectory; set it in `fix"),
-    (("parameters", "pads.upper.length"), {"low": 70e-3, "high": 80e-3},
+    ('parameters."materials.rubber.E" = {low = 9e5, high = 8e5}', "rubber.E: low = 9"),
+    ('parameters."materials.rubber.E" = {low = -1.0, high = 0.9e6, scale = "log"}',
+     "logarithmic range needs low > 0"),
+    ('parameters."laws.dry.friction.mu_k" = {low = 0.75, high = 0.9}',
+     r"mu_k.high = 0.9: .* must not exceed mu_s"),
+    ('parameters."laws.dry.friction.mu_k" = {low = 0.8, high = 1.0, ratio_to = "laws.dry.mu"}',
+     "mu_k.ratio_to: `laws.dry.mu` is not in the"),
+    ('parameters."materials.rubber.E" = '
+     '{low = 0.3, high = 0.7, ratio_to = "laws.dry.friction.mu_k"}', "mu_k is a ratio itself"),
+    (f'parameters."pads.upper.elements_x" = {SPAN}',
+     "the same in every trajectory; set it in `fix"),
+    ('parameters."pads.upper.length" = {low = 70e-3, high = 80e-3}',
      "length.low = 0.07: it changes the contact points of pads.upper"),
-    (("parameters", "bodies.disc.theta"), {"low": 0.0, "high": 1e-3},
+    ('parameters."bodies.disc.theta" = {low = 0.0, high = 1e-3}',
      "theta.low = 0: it changes the coordinates and energies of the rig"),
-    (("parameters", "contacts.above.pad"), SPAN, "is no number, but 'upper'"),
-    (("parameters", "outputs.duration"), SPAN, "`outputs.duration` has no part in a dataset"),
-    (("parameters", "pads.lower.elements_x"), SPAN, "is in `fixed` as well"),
-    (("fixed", "pads.lower.elements"), 3, "fixed.pads.lower.elements: .*you mean `elements_y`"),
-    (("channels",), ["x_disk"], "channels: `x_disk` is no channel of the rig; there are x_disc"),
-    (("channels",), ["x_disc", "x_disc"], "channels: every name once"),
-    (("duration",), 0.102, "duration = 0.102 s is not a whole number of sample_interval"),
-    (("kinds", 0, "name"), "grip", "kinds: every name once"),
-    (("kinds", 0, "fixed", "motion.x_e"), {"kind": "hold"}, "kinds.0.*x_e.*did you mean `x_d`"),
-    (("kinds", 0, "fixed", E), 1e6, "kinds.0.parameters.materials.rubber.E: it is in `fixed`"),
-    (("kinds", 0, "parameters", "motion.x_d.stroke_time"), {"low": 1e-6, "high": 1e-2},
+    (f'parameters."contacts.above.pad" = {SPAN}', "is no number, but 'upper'"),
+    (f'parameters."outputs.duration" = {SPAN}', "`outputs.duration` has no part in a dataset"),
+    (f'parameters."pads.lower.elements_x" = {SPAN}', "is in `fixed` as well"),
+    ('fixed."pads.lower.elements" = 3', "fixed.pads.lower.elements: .*you mean `elements_y`"),
+    ('channels = ["x_disk"]', "channels: `x_disk` is no channel of the rig; there are x_disc"),
+    ('channels = ["x_disc", "x_disc"]', "channels: every name once"),
+    ("duration = 0.102", "duration = 0.102 s is not a whole number of sample_interval"),
+    (KINDS.replace('"stroke"', '"grip"'), "kinds: every name once"),
+    (stroke('fixed."motion.x_e" = {kind = "hold"}'), "kinds.0.*x_e.*did you mean `x_d`"),
+    (stroke('fixed."materials.rubber.E" = 1e6'),
+     "kinds.0.parameters.materials.rubber.E: it is in `fixed`"),
+    (stroke('parameters."motion.x_d.stroke_time" = {low = 1e-6, high = 1e-2}'),
      "kinds.0.*stroke_time.low = 1e-06: impossible: .* makes 50000 strokes"),
-    (("kinds", 0, "fixed", "motion.y_d"), {"kind": "hold", "value": 49e-3},
+    (stroke('fixed."motion.y_d" = {kind = "hold", value = 49e-3}'),
      "kinds.0.parameters.motion.y_d.values_2: `motion.y_d.values_2` is not in"),
-    (("kinds", 0, "fixed", "motion.y_d.values"), ["held", 49e-3], '"held" stands for the effort'),
-    (("kinds", 0, "fixed", "pads.lower.points"), 2, "kinds.0.fixed: it changes the contact points"),
+    (stroke('fixed."motion.y_d.values" = ["held", 49e-3]'), '"held" stands for the effort'),
+    (stroke('fixed."pads.lower.points" = 2'), "kinds.0.fixed: it changes the contact points"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("place", "value", "message"), MISTAKES)
-def test_a_mistake_is_named_by_its_field(tree, place, value, message):
+@pytest.mark.parametrize(("change", "message"), MISTAKES)
+def test_a_mistake_is_named_by_its_field(tree, change, message):
+    changes = tomllib.loads(change).items()
+    other = {k: tree[k] | new if isinstance(new, dict) else new for k, new in changes}
     with pytest.raises(InvalidTable) as error:
-        Config.model_validate(changed(tree, place, value))
+        Config.model_validate(tree | other)
     assert re.search(message, str(error.value)), str(error.value)
     assert "\n" not in str(error.value)
 

@@ -7,9 +7,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import fsspec
@@ -18,9 +16,8 @@ import pytest
 import torch
 import xarray as xr
 import zarr
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from test_datasets import COUNT, SHM, data, faults, made
+from hostile.damage import BYTES, Victim, damage
+from test_datasets import data, faults, made
 from torch.utils.data import DataLoader
 
 from torchsoft.datasets import Trajectories, open_dataset
@@ -34,11 +31,6 @@ def copied(source: Path, folder: Path | str) -> Path:
 
 # what is damaged
 # ----------------------------------------------------------------------
-
-
-def flipped(content: bytes, place: float) -> bytes:
-    i = int(place * len(content))
-    return content[:i] + bytes([content[i] ^ 4]) + content[i + 1 :]
 
 
 @pytest.mark.parametrize(
@@ -82,7 +74,7 @@ def test_damage_is_found_without_this_package(made, tmp_path):
     if tool := shutil.which("sha256sum"):
         assert subprocess.run(command, cwd=folder, capture_output=True).returncode == 0
     for name in ("theta_disc/c/0/0", "motion.y_d.values_2/c/1"):
-        (folder / name).write_bytes(flipped((folder / name).read_bytes(), 0.5))
+        damage(BYTES["a bit"], Victim(folder / name, np.random.default_rng(0)))
         with pytest.raises(ValueError, match="checksum"):
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
     if tool:

@@ -135,7 +135,7 @@ def test_episodes_end_with_a_sentence():
     *_, terminated, _, info = env.step(TURN)
     assert terminated
     assert "disc.theta = " in info["ended"]
-    hung = FILE.override(bodies={"disc": {"start": {"y": 40e-3}}, "upper": {"start": {"y": 0.08}}})
+    hung = FILE.override({"bodies.disc.start.y": 40e-3, "bodies.upper.start.y": 0.08})
     env = small(rig=hung, interval=0.01, failure_reward=-7.0)
     env.reset(seed=0)
     _, reward, terminated, _, info = env.step(np.zeros(3, np.float32))
@@ -172,7 +172,7 @@ def test_seeds_draw_goals_and_parameters():
 
 
 def test_starts_that_cannot_be_are_drawn_again():
-    lying = FILE.override(bodies={"disc": {"start": {"y": "rest"}}})
+    lying = FILE.override({"bodies.disc.start.y": "rest"})
     env = small(rig=lying, parameters={"bodies.disc.start.x": (0.0, 0.05)})
     with pytest.warns(RedrawnStart, match=r"no episode begins with bodies.disc.start.x = 0.0.*pad"):
         env.reset(seed=0)

@@ -2,11 +2,8 @@
 the pages are those of the stored results."""
 
 import json
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,44 +11,13 @@ from conftest import COARSE, paper
 
 from experiments import tables
 from experiments.frame import Table, numbers, write
+from experiments.validation import step_accuracy
 from experiments.validation.rolling_resistance import layer_compliance
 
-Claims = Callable[[Any], None]
-SMOKE = dict.fromkeys(
-    ("grasp_and_roll", "step_accuracy", "gradient_accuracy", "identify_contact",
-     "interval_coverage", "reduced_model"), len,
-)  # fmt: skip
+# what a program claims of its summary
+# ----------------------------------------------------------------------
 
 
-def program(name: str) -> ModuleType:
-    folder = (
-        "" if name in ("grasp_and_roll", "identify_contact", "reduced_model") else "validation."
-    )
-    return import_module(f"experiments.{folder}{name}")
-
-
-def claims(check: Claims) -> Claims:
-    """What the program of the same name claims, of its summary."""
-    SMOKE[check.__name__] = check
-    return check
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SMOKE)
-def test_a_program_keeps_its_claims_at_smoke_size(name, tmp_path):
-    module = program(name)
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["tables"]
-    assert not list(tmp_path.glob("*partial*"))
-    SMOKE[name](summary)
-
-
-def near(value: float, **how: Any) -> Any:
-    return pytest.approx(value, **how)
-
-
-@claims
 def foreign_rigs(found):
     """Recordings of the same rig hold; a flipped sign is named."""
     same, flipped = found["cases"]
@@ -60,7 +26,6 @@ def foreign_rigs(found):
     assert flipped["named"] == 1
 
 
-@claims
 def rolling_resistance(found):
     """Force and power give one resistance, near theory's, with a peak."""
     (rubber,), (light,) = found["by speed"].values(), found["by load"].values()
@@ -69,18 +34,17 @@ def rolling_resistance(found):
         assert abs(one["power / force - 1"]) < 0.01
         assert 0.97 < one["measured / theory"] < 1.06
     assert top["measured"] > 1.2 * max(low["measured"], high["measured"])
-    assert light["measured / theory"] == near(1.01, abs=0.02)
+    assert light["measured / theory"] == pytest.approx(1.01, abs=0.02)
 
 
 def test_compliance_of_a_layer_has_both_limits():
     """Long waves compress a layer uniaxially, short ones see a half-plane."""
     h, nu = 4e-3, 0.3
     long, deep, deeper = layer_compliance(np.array([1e-3, 11.9, 12.1]) / h, h, nu)
-    assert long[1, 1].real == near(h * (1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-5)
+    assert long[1, 1].real == pytest.approx(h * (1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-5)
     assert np.abs(deeper / deep * 12.1 / 11.9 - 1).max() < 1e-6
 
 
-@claims
 def contact_theory(found):
     """Sliding, spin, Hertz, partial slip and creep are the textbook's to a percent or less."""
     assert abs(found["slopes"]["20"]["found [m/s2]"]) < 1e-4  # it sticks
@@ -93,11 +57,10 @@ def contact_theory(found):
         assert abs(slid[f"c, {part}"]) < 3e-3
         assert abs(slid[f"shear, {part}"]) < 0.02
     assert found["pressure"]["40 elements, springs 400 E*/a"]["punch: p"] < 3e-3
-    assert roll["Q / (mu P)"] == near(0.5, abs=1e-3)
+    assert roll["Q / (mu P)"] == pytest.approx(0.5, abs=1e-3)
     assert abs(roll["off"]) < 5e-3
 
 
-@claims
 def peers(found):
     """Positions after a slide are theory's, and their derivatives but for the ripple of nodes."""
     table = found["tables"]["torchsoft"]
@@ -120,6 +83,26 @@ def test_the_inertia_of_pads_changes_nothing_that_can_be_measured():
         assert (massless[channel] - inertial[channel]).abs().max() < most, channel
 
 
+SMOKE = {
+    "grasp_and_roll": len, "identify_contact": len, "reduced_model": len,
+    "validation.step_accuracy": len, "validation.gradient_accuracy": len,
+    "validation.interval_coverage": len, "validation.foreign_rigs": foreign_rigs,
+    "validation.rolling_resistance": rolling_resistance,
+    "validation.contact_theory": contact_theory, "validation.peers": peers,
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMOKE)
+def test_a_program_keeps_its_claims_at_smoke_size(name, tmp_path):
+    module = import_module(f"experiments.{name}")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["tables"]
+    assert not list(tmp_path.glob("*partial*"))
+    SMOKE[name](summary)
+
+
 # frame and tables
 # ----------------------------------------------------------------------
 
@@ -134,9 +117,8 @@ def test_the_tables_of_a_page_are_those_of_the_results(page):
 def test_a_summary_becomes_a_table_with_its_commit(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "RESULTS", tmp_path / "results")
     tables.RESULTS.mkdir()
-    module = program("step_accuracy")
     mark = "<!-- table step_accuracy motion -->\nold\n<!-- end -->\n"
-    config = module.Config(out=tmp_path / "step_accuracy")
+    config = step_accuracy.Config(out=tmp_path / "step_accuracy")
     write(config, {}, {"motion": numbers("way", {"rtol = 1e-3": {"error": 0.5}})})
     tables.store(config.out / "summary.json")
     page = tables.filled(mark)
@@ -144,6 +126,6 @@ def test_a_summary_becomes_a_table_with_its_commit(tmp_path, monkeypatch):
     assert "Commit: " in page
     with pytest.raises(ValueError, match="no table 'other'"):
         tables.filled(mark.replace("motion", "other"))
-    write(module.Config(out=config.out, smoke=True), {}, {})
+    write(step_accuracy.Config(out=config.out, smoke=True), {}, {})
     with pytest.raises(ValueError, match="give the summary of a whole run"):
         tables.store(Path(config.out) / "summary.json")

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import tomllib
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hostile.damage import document
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tqdm import tqdm
@@ -26,34 +26,35 @@ from torchsoft.rigs.goal import Goal, drawn, plan_file
 from torchsoft.rigs.written import template, to_toml
 
 ROOT = Path(__file__).parents[1]
-FILE = RigFile.from_toml(ROOT / "examples" / "plan" / "reorient.toml").override(
-    pads={"left_tip": {"elements_x": 40, "elements_y": 2, "points": 1},
-          "right_tip": {"elements_x": 40, "elements_y": 2, "points": 1}},
-    motion={"left_x": {"times": [0.0, 0.2, 0.5], "values": ["start"] * 3},
-            "right_x": {"times": [0.0, 0.2, 0.5], "values": ["start"] * 3},
-            "left_y": {"times": [0.2, 0.35, 0.5], "values": ["start"] * 3},
-            "right_y": {"times": [0.2, 0.5], "values": ["start"] * 2},
-            "lean": {"times": [0.2, 0.5], "values": [0.0] * 2}},
-    outputs={"duration": 0.6},
-)  # fmt: skip
+CHANGES = """
+pads.left_tip = {elements_x = 40, elements_y = 2, points = 1}
+pads.right_tip = {elements_x = 40, elements_y = 2, points = 1}
+outputs.duration = 0.6
+[motion]
+left_x = {times = [0.0, 0.2, 0.5], values = ["start", "start", "start"]}
+right_x = {times = [0.0, 0.2, 0.5], values = ["start", "start", "start"]}
+left_y = {times = [0.2, 0.35, 0.5], values = ["start", "start", "start"]}
+right_y = {times = [0.2, 0.5], values = ["start", "start"]}
+lean = {times = [0.2, 0.5], values = [0.0, 0.0]}
+"""
+REORIENT = RigFile.from_toml(ROOT / "examples" / "plan" / "reorient.toml")
+FILE = REORIENT.override(**tomllib.loads(CHANGES))
 BUILT = FILE.build()
-FREE = {
-    "left_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
-    "right_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
-    "right_x": Bounds(low=15e-3, high=25e-3, speed=0.1, after=0.2),
-}
-TURN = Target(channel="theta_object", value=math.radians(10), tolerance=math.radians(0.5))
-PLACE = {
-    "x": Target(channel="x_object", value=0.0, tolerance=1e-4),
-    "y": Target(channel="y_object", value=0.0, tolerance=1e-4),
-}
-GOAL = {
-    "free": {k: one.model_dump(exclude_none=True) for k, one in FREE.items()},
-    "targets": {
-        k: one.model_dump(exclude_none=True) for k, one in ({"turn": TURN} | PLACE).items()
-    },
-    "rtol": 1e-3,
-}
+GOAL = """
+rtol = 1e-3
+[free]
+left_y = {low = -25e-3, high = 25e-3, speed = 0.3, after = 0.2}
+right_y = {low = -25e-3, high = 25e-3, speed = 0.3, after = 0.2}
+right_x = {low = 15e-3, high = 25e-3, speed = 0.1, after = 0.2}
+[targets]
+turn = {channel = "theta_object", value = 0.175, tolerance = 8.75e-3}
+x = {channel = "x_object", value = 0.0, tolerance = 1e-4}
+y = {channel = "y_object", value = 0.0, tolerance = 1e-4}
+"""
+"""The body is turned by 10 degrees, to half a degree, and stays where it is."""
+
+READ = Goal.model_validate(tomllib.loads(GOAL))
+FREE, TARGETS, TURN = READ.free, READ.targets, READ.targets["turn"]
 
 
 def planned(free: Free = FREE, **how: Any) -> Plan:
@@ -63,7 +64,7 @@ def planned(free: Free = FREE, **how: Any) -> Plan:
 
 @pytest.fixture(scope="module")
 def turned():
-    return planned(targets={"turn": TURN} | PLACE)
+    return planned(targets=TARGETS)
 
 
 # derivatives and terms
@@ -84,7 +85,7 @@ def test_slopes_are_the_differences():
     limits = {"grip": Limit(channel="effort_left_x", low=4.0, high=50.0, since=0.1)}
     objective = lambda run: run["effort_left_y"].square().mean()
     over = {"materials.silicone.E": torch.tensor([5e5, 5.2e5]).double()}
-    search = searched(free, 1e-9, over, Terms(objective, {"turn": TURN} | PLACE, limits))
+    search = searched(free, 1e-9, over, Terms(objective, TARGETS, limits))
     evaluate, z = search.evaluator.evaluate, search.evaluator.variables.start.copy()
     z[:3] += [-0.1, 0.12, -0.05]
     found = evaluate(z)
@@ -139,7 +140,7 @@ def test_a_limit_is_kept_at_a_price(turned):
     low = float(turned.trajectory["effort_left_x"][30:].min()) + 1.0
     limits = {"grip": Limit(channel="effort_left_x", low=low, since=0.5)}
     free = FREE | {"left_x": Bounds(low=-25e-3, high=-15e-3, speed=0.1, after=0.2)}
-    found = planned(free, targets={"turn": TURN} | PLACE, limits=limits)
+    found = planned(free, targets=TARGETS, limits=limits)
     assert found.reached
     assert float(found.trajectory["effort_left_x"][50:].min()) >= low * (1 - 2e-3)
 
@@ -178,7 +179,7 @@ def test_an_unreachable_target_has_reasons():
     """A turn by 170 degrees ends where the body leaves a pad; the best so far is kept, also where
     the time is over."""
     far = TURN.model_copy(update={"value": math.radians(170)})
-    found = planned(targets={"turn": far} | PLACE, iterations=1, seconds=1e-9)
+    found = planned(targets=TARGETS | {"turn": far}, iterations=1, seconds=1e-9)
     assert (found.reached, found.holds, len(found.history)) == (False, 0.0, 1)
     assert any("turn is -" in reason for reason in found.reasons)
     assert any("as was asked for" in notice for notice in found.notices)
@@ -194,18 +195,27 @@ def test_more_targets_than_free_values_are_reached_where_they_can_be():
     assert any("more targets (2) than values (1): add knots" in one for one in found.reasons)
 
 
+def pressed(changes: str) -> RigFile:
+    """The template, changed, on coarse pads."""
+    return template("press").override(**tomllib.loads(PRESSED + changes))
+
+
+PRESSED = """
+pads.lower = {elements_x = 20, elements_y = 2, points = 1}
+pads.upper = {elements_x = 20, elements_y = 2, points = 1}
+outputs.duration = 0.3
+motion.x_d.kind = "hold"
+"""
+
+
 def test_slip_before_anything_may_move_is_no_reason():
     """At touch-down every point slips for a moment."""
-    few = {"elements_x": 20, "elements_y": 2, "points": 1}
-    file = template("press").override(
-        pads={"lower": few, "upper": few}, outputs={"duration": 0.3},
-        bodies={"disc": {"start": {"x": 1e-3}}, "bracket": {"start": {"y": "touch"}}},
-        motion={
-            "x_d": {"kind": "hold"},
-            "y_d": {"times": [0.0, 0.02, 0.1, 0.2], "values": ["start"] * 4},
-            "press": {"times": [0.0, 0.1], "values": [0.0, -20.0]},
-        },
-    )  # fmt: skip
+    file = pressed("""
+bodies.disc.start.x = 1e-3
+bodies.bracket.start.y = "touch"
+motion.y_d = {times = [0.0, 0.02, 0.1, 0.2], values = ["start", "start", "start", "start"]}
+motion.press = {times = [0.0, 0.1], values = [0.0, -20.0]}
+""")
     built = file.build()
     for after, slips in ((0.02, True), (0.1, False)):
         found = plan(
@@ -230,7 +240,7 @@ def test_runs_that_fail_are_worse_and_an_interrupt_keeps_the_best(monkeypatch, c
         return found
 
     monkeypatch.setattr(Evaluator, "evaluate", failing)
-    found = planned(targets={"turn": TURN} | PLACE)
+    found = planned(targets=TARGETS)
     said = "\n".join(found.notices)
     if case == "finer":
         assert (found.reached, found.holds) == (False, 0.0)
@@ -281,9 +291,8 @@ def test_a_limit_needs_a_bound():
 
 def test_a_start_that_cannot_be_run_is_rejected():
     """A body that nothing holds."""
-    slippery = FILE.override(
-        laws={"dry": {"friction": {"kind": "smooth", "mu_s": 0.02, "mu_k": 0.02, "v_s": 0.05}}}
-    ).build()
+    friction = {"laws.dry.friction.mu_s": 0.02, "laws.dry.friction.mu_k": 0.02}
+    slippery = FILE.override(friction).build()
     limits = {"up": Limit(channel="y_object", low=-1e-3)}
     with pytest.raises(ValueError, match=r"no start of the plan can be run: draw 0"):
         plan(slippery.rig, torch.linspace(0, 3.0, 61), FREE, **TURNED, limits=limits,
@@ -294,15 +303,20 @@ def test_a_start_that_cannot_be_run_is_rejected():
 # ----------------------------------------------------------------------
 
 
+UNCERTAIN = """
+[targets]
+start = {channel = "M_left_tip", value = 0.0, tolerance = 1.0, at = 0.0}
+[uncertain]
+"materials.silicone.E" = {low = 4e5, high = 6e5}
+"""
+
+
 def test_every_draw_starts_from_the_equilibrium_of_its_own_parameters():
     """The first has the stated values, or the estimates of an identification, whose draws are taken
     as they are."""
     E, K_n = "materials.silicone.E", "laws.dry.K_n"
-    start = {"channel": "M_left_tip", "value": 0.0, "tolerance": 1.0, "at": 0.0}
-    goal = Goal.model_validate(
-        GOAL | {"targets": {"start": start}, "uncertain": {E: {"low": 4e5, "high": 6e5}},
-                "draws": 2, "iterations": 1}
-    )  # fmt: skip
+    head, _ = GOAL.split("[targets]")
+    goal = Goal.model_validate(tomllib.loads(f"draws = 2\niterations = 1\n{head}{UNCERTAIN}"))
     known = {K_n: [2e5, 1.9e5, 2.1e5]}
     over = drawn(FILE, goal, 2, seed=goal.seed, known=known)
     assert over[K_n].tolist() == known[K_n]
@@ -321,7 +335,7 @@ def test_every_draw_starts_from_the_equilibrium_of_its_own_parameters():
 
 def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text(to_toml(FILE), encoding="utf-8")
-    (tmp_path / "goal.toml").write_text(document(GOAL), encoding="utf-8")
+    (tmp_path / "goal.toml").write_text(GOAL, encoding="utf-8")
     command = ["plan", *(str(tmp_path / name) for name in ("rig.toml", "goal.toml"))]
     command += ["--out", str(tmp_path / "out"), "--no-progress"]
     assert main(command) == 0
@@ -333,28 +347,26 @@ def test_the_command_writes_a_rig_file_that_runs(tmp_path, capsys):
     assert list(planned) != FILE.motion["left_y"].values
     stored = json.loads((tmp_path / "out" / "plan.json").read_text())
     assert (stored["reached"], stored["made_by"]["rtol"]) == (True, 1e-3)
-    (tmp_path / "goal.toml").write_text(document(GOAL | {"drws": 3}), encoding="utf-8")
+    (tmp_path / "goal.toml").write_text("drws = 3" + GOAL, encoding="utf-8")
     assert main([*command, "--force"]) == 2
     assert "drws" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("press", "reached"), [([0.0, -20.0], True), (["held", "held"], False)])
+@pytest.mark.parametrize(("press", "reached"), [("[0, -20]", True), ('["held", "held"]', False)])
 def test_the_written_file_is_run_again(press, reached):
     """The file's own run is told: an offset is not added twice, and an effort that is held anew
     with the planned set-points is named."""
-    few = {"elements_x": 40, "elements_y": 2}
-    file = template("press").override(
-        pads={"lower": few, "upper": few}, outputs={"duration": 0.3},
-        motion={
-            "x_d": {"kind": "hold"},
-            "y_d": {"times": [0.0, 0.2], "values": [0.0, -0.9e-3], "offset": "start"},
-            "press": {"times": [0.0, 0.2], "values": press},
-        },
-    )  # fmt: skip
-    goal = Goal.model_validate({
-        "free": {"y_d": {"low": 45e-3, "high": 52e-3, "speed": 0.1, "after": 0.1}}, "rtol": 1e-3,
-        "targets": {"down": {"channel": "y_bracket", "value": 48.7e-3, "tolerance": 1e-5}},
-    })  # fmt: skip
+    file = pressed(f"""
+motion.y_d = {{times = [0.0, 0.2], values = [0.0, -0.9e-3], offset = "start"}}
+motion.press = {{times = [0.0, 0.2], values = {press}}}
+""")
+    goal = Goal.model_validate(
+        tomllib.loads("""
+rtol = 1e-3
+free.y_d = {low = 45e-3, high = 52e-3, speed = 0.1, after = 0.1}
+targets.down = {channel = "y_bracket", value = 48.7e-3, tolerance = 1e-5}
+""")
+    )
     found, written = plan_file(file, goal)
     built = written.build()
     again = simulate(built.rig, built.t, y0=built.y0, rtol=1e-5)

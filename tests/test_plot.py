@@ -21,10 +21,8 @@ from torchsoft.plot.dashboard import dashboard, energy_groups
 from torchsoft.plot.diagram import LAYER, graph_of, multibond_graph, positions
 from torchsoft.plot.scene import instants
 
-Done = tuple[Rig, Trajectory]
 
-
-def manipulated(changes: Mapping[str, Any] = {}) -> Done:
+def manipulated(changes: Mapping[str, Any] = {}) -> tuple[Rig, Trajectory]:
     """The first 0.2 s of the grasp on a coarse mesh."""
     built = paper(COARSE | changes)
     return built.rig, built.run(times(0.2, 21))

@@ -9,6 +9,8 @@ from functools import partial
 from typing import Any
 
 import pytest
+from conftest import RUBBER
+from test_rejected_calls import TRIANGLE
 from torch import Tensor
 
 import torchsoft as ts
@@ -144,13 +146,11 @@ def test_a_number_of_a_file_is_rejected_with_its_field(file, name, leaf, wrap):
 # constructors of parts
 # ----------------------------------------------------------------------
 
-RUBBER = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 SERIES = {"moduli": [1e5], "times": [0.1]}
 BOX = {"length": 0.04, "height": 4e-3, "elements_x": 8, "elements_y": 2}
 SLIP = {"mu_s": 0.8, "mu_k": 0.7}
 ENERGY = {"tau": 0.01} | SERIES | {k: x for k, x in RUBBER.items() if k != "E"}
 SPRINGS = {"K_n": 1e5, "R_n": 4e2, "K_t": 1e5, "R_t": 4e2}
-TRIANGLE = [(-12e-3, -9e-3), (19e-3, -9e-3), (-12e-3, 18e-3)]
 
 USUAL = {
     "shape": ts.Circle(0.02), "material": ts.KelvinVoigt(**RUBBER, tau=0.01),

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -286,7 +287,7 @@ def test_run_writes_everything(small, tmp_path, capsys):
 def test_what_is_wrong_is_not_run_unless_it_is_meant(small, tmp_path, capsys):
     path, out = tmp_path / "wrong.toml", tmp_path / "out"
     quiet = {"video": "none", "figures": False}
-    wrong = RigFile.from_toml(small).override(bodies={"stone": STONE}, outputs=quiet)
+    wrong = RigFile.from_toml(small).override(**tomllib.loads(STONE), outputs=quiet)
     path.write_text(to_toml(wrong), encoding="utf-8")
     assert main(["check", str(path)]) == 2
     assert "error: bodies.disc: it and bodies.stone overlap" in capsys.readouterr().out

@@ -141,37 +141,6 @@ def test_a_misfit_far_above_the_noise_is_not_refined(short):
     assert f"χ² = {content['chi2']:.3g}" in answer.headline
 
 
-def test_what_the_data_do_not_determine_has_no_value():
-    gentle = stroked(travel=1e-3, stroke_time=0.1, duration=0.4, grasp=0.1, since=0.15)
-    data = record("gentle", excited(gentle, BASE), {}, SENSORS, rtol=1e-5, seed=1)
-    answer = fit(data, {E: Unknown(), MU_K: Unknown()}, 1e-4)
-    unseen, seen = answer[MU_K], answer[E]
-    assert not unseen.identifiable
-    assert unseen.value is unseen.ci95 is None
-    assert seen.identifiable
-    assert seen.ci95[0] < BASE.materials["rubber"].E < seen.ci95[1]
-    weak = [one.facts["estimate"] for one in answer.findings if one.code == "not-identifiable"]
-    assert weak == [MU_K]
-    row = next(e for e in json.loads(answer.to_json())["estimates"] if e["name"] == MU_K)
-    assert row["value"] is None
-    assert "not identifiable" in answer.table()
-
-
-def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(short):
-    t, theta = short.samples["theta_C"]
-    late = np.interp(t - 1.5e-3, t, theta) + 2e-3
-    samples = short.samples | {
-        "theta_C": (t[3::2], late[3::2]),
-        "effort_x": tuple(x[:30] for x in short.samples["effort_x"]),
-    }
-    sensors = SENSORS | {"theta_C": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
-    data = replace(short, name="gaps", samples=samples)
-    answer = fit(data, {E: Unknown()} | known(K_N, MU_S, MU_K, TAU), 1e-4, sensors, tightenings=0)
-    assert answer[E].value == pytest.approx(TRUTH[E], rel=2e-3)
-    assert answer["bias of theta_C"].value == pytest.approx(2e-3, abs=1e-4)
-    assert answer["delay of theta_C"].value == pytest.approx(1.5e-3, abs=1e-4)
-
-
 def test_a_regular_grid_between_the_samples_changes_nothing(short):
     problem, runner = Problem([short], SENSORS, four()), Runner([short])
     exact = problem.residuals(runner, problem.coordinates.start, ["short"], 1e-5).r

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, PAPER, RUBBER, dry, excited, stroked
+from conftest import COARSE, PAPER, excited, stroked
 
-from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Reference, Rig
+from torchsoft import Rig, RigFile
 from torchsoft.sysid import Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.assumptions import AMOUNTS, Suspect, suspects
 from torchsoft.sysid.initial_state import Standing
@@ -53,16 +53,14 @@ def strokes(kind: str = "kelvin_voigt") -> Recording:
 
 @cache
 def thrown() -> Recording:
-    """A disc in free flight, which spins; the pad is far below."""
-    mesh = PadMesh(length=20e-3, height=4e-3, elements_x=4, elements_y=2)
-    rig = Rig(
-        bodies={"disc": Body(0.4, Circle(19e-3))},
-        pads={"floor": Pad(mesh, KelvinVoigt(**RUBBER, tau=0.01))},
-        contacts={"floor": Contact("floor", "disc", dry(), may_leave=True)}, reference=Reference(),
-    )  # fmt: skip
-    y0 = rig.state(disc={"x": 0.01, "y": 2.0, "v_x": 0.3, "v_y": 1.0, "omega": 20.0})
+    """A body in free flight, which spins; the pad is far below."""
+    start = {"x": 0.01, "y": 2.0, "theta": 0.0, "v_x": 0.3, "v_y": 1.0, "omega": 20.0}
+    changes = {"pads.ground.elements_x": 8, "contacts.ground.may_leave": True}
+    file = RigFile.ready("drop").override(changes, bodies={"ellipse": {"start": start}})
+    rig, y0, _ = file.build()
     t = np.linspace(0.0, 0.2, 21)
-    samples = dict.fromkeys(("x_disc", "y_disc"), (t, 0 * t)) | {"theta_disc": (t, 20.0 * t)}
+    samples = dict.fromkeys(("x_ellipse", "y_ellipse"), (t, 0 * t))
+    samples |= {"theta_ellipse": (t, 20.0 * t)}
     return Recording("flight", rig, samples, Standing.of(rig, y0, lead=0.0))
 
 
@@ -70,20 +68,20 @@ def thrown() -> Recording:
 def test_a_body_whose_mass_is_off_its_contour_flies_about_its_centre_of_mass(c):
     """Which goes on a parabola, while the spin stays what it is."""
     flight, axis = thrown(), "x" if c[0] else "y"
-    made = changed(flight, f"bodies.disc.centre_{axis}", sum(c))
+    made = changed(flight, f"bodies.ellipse.centre_{axis}", sum(c))
     at = run_of(made)
     found = dict(zip(made.channels, at.signals.T))
     t, offset = at.t, np.array(c)[:, None]
     speed = [0.3 - 20.0 * c[1], 1.0 + 20.0 * c[0]]
     exact = [0.01 + c[0] + speed[0] * t, 2.0 + c[1] + speed[1] * t - 0.5 * 9.81 * t**2]
-    np.testing.assert_allclose([found["x_disc"], found["y_disc"]], exact, atol=1e-9)
-    np.testing.assert_allclose(found["theta_disc"], 20.0 * t, atol=1e-5)
-    times, angle = flight.samples["theta_disc"]
+    np.testing.assert_allclose([found["x_ellipse"], found["y_ellipse"]], exact, atol=1e-9)
+    np.testing.assert_allclose(found["theta_ellipse"], 20.0 * t, atol=1e-5)
+    times, angle = flight.samples["theta_ellipse"]
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    shift = [made.samples[name][1] - flight.samples[name][1] for name in ("x_disc", "y_disc")]
+    shift = [made.samples[name][1] - flight.samples[name][1] for name in ("x_ellipse", "y_ellipse")]
     np.testing.assert_allclose(shift, (R * offset[None]).sum(1), atol=1e-12)
-    blind = replace(flight, samples={"x_disc": (times, 0 * times)})
-    assert changed(blind, f"bodies.disc.centre_{axis}", sum(c)) is None
+    blind = replace(flight, samples={"x_ellipse": (times, 0 * times)})
+    assert changed(blind, f"bodies.ellipse.centre_{axis}", sum(c)) is None
 
 
 @pytest.mark.parametrize("name", ["x", "y"])
@@ -145,7 +143,7 @@ def test_springs_that_follow_the_pads_follow_those_of_an_alternative():
 
 def test_a_run_from_a_state_of_the_pads_has_no_other_pads():
     known = replace(thrown(), start=Known(thrown().run_context().y0({})))
-    for name in ("tilt of the pad floor", "height of the pad floor", "mesh"):
+    for name in ("tilt of the pad ground", "height of the pad ground", "mesh"):
         assert changed(known, name, 0.1) is None
 
 
@@ -165,15 +163,15 @@ def test_a_camera_has_a_scale_about_zero_or_its_first_sample():
 def test_a_camera_that_is_turned_mixes_coordinates_about_their_first_samples():
     """Of a disc in the plane, at other times in one coordinate."""
     t, late = np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 21)
-    path = {"x_disc": lambda t: 0.1 + t, "y_disc": lambda t: 2.0 - 3.0 * t}
+    path = {"x_ellipse": lambda t: 0.1 + t, "y_ellipse": lambda t: 2.0 - 3.0 * t}
     c, s = np.cos(1e-3), np.sin(1e-3)
     seen = {
-        "x_disc": (t, 0.1 + c * t - 3.0 * s * t),
-        "y_disc": (late, 2.0 - 3.0 * c * late - s * late),
+        "x_ellipse": (t, 0.1 + c * t - 3.0 * s * t),
+        "y_ellipse": (late, 2.0 - 3.0 * c * late - s * late),
     }
     data = replace(thrown(), samples=seen)
     sensors = dict.fromkeys(seen, Sensor(noise=1e-5))
-    turned = changed(data, "angle of the camera on disc", 1e-3, sensors=sensors).samples
+    turned = changed(data, "angle of the camera on ellipse", 1e-3, sensors=sensors).samples
     for channel, (at, _) in seen.items():
         np.testing.assert_allclose(turned[channel][1], path[channel](at), atol=4e-6)
 

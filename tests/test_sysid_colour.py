@@ -8,7 +8,6 @@ from test_sysid_noise import made
 from test_sysid_suspects import BALL, K_N, SENSORS, TRUTH, E
 
 from torchsoft.sysid import (
-    IdentificationResult,
     Problem,
     Recording,
     Stage,
@@ -57,14 +56,10 @@ def test_intervals_hold_under_coloured_noise_which_is_named_unless_it_was_declar
     assert answer.verdict == "holds"
     for name, truth in TRUTH.items():
         assert abs(np.log(answer[name].last / truth)) < 3 * answer[name].relative_sd, name
-    assert answer[E].relative_sd > 1.3 * np.linalg.inv(fisher(own, answer))[0, 0] ** 0.5
-
-
-def fisher(own: Problem, answer: IdentificationResult) -> np.ndarray:
-    """Fisher's matrix at an answer as if the noise were white."""
     x, free, runner = np.array(answer.x), own.coordinates.free, Runner(own.recordings)
     J = own.residuals(runner, x, own.names, 1e-4, free).J
-    return J.T @ J
+    white = np.linalg.inv(J.T @ J)  # the covariance if the noise were white
+    assert answer[E].relative_sd > 1.3 * white[0, 0] ** 0.5
 
 
 def test_residuals_are_whitened_at_once_and_again_from_other_noise(coloured):

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE, PAPER, RIG, excited, stroked
 from scipy import stats
+from test_sysid_assumptions import thrown
 
-from torchsoft.sysid import Problem, Sensor, Stage, Unknown, record
+from torchsoft.sysid import Problem, Sensor, Stage, Unknown
 from torchsoft.sysid.compare import Density, LawFit, compare, density, judged, versus
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import Part
@@ -127,13 +127,12 @@ def test_the_conclusion_is_that_of_the_numbers(a, b, rough, outcome, says):
 
 
 def test_laws_that_were_not_given_the_same_data_are_refused():
-    sensors = {name: RIG[name] for name in ("x_C", "theta_C", "effort_x")}
-    brief = stroked(travel=2e-3, stroke_time=0.05, duration=0.2, grasp=0.1, since=0.12)
-    recording = record("one", excited(brief, PAPER.override(COARSE)), {}, sensors, rtol=1e-2)
-    one = Problem([recording], sensors, {"contact.mu_s": Unknown()})
+    recording = replace(thrown(), name="one")
+    sensors = dict.fromkeys(recording.samples, Sensor(noise=1e-5))
+    one = Problem([recording], sensors, {"laws.dry.friction.mu_s": Unknown()})
 
     def other(sensors=sensors, **changes):
-        return Problem([replace(recording, **changes)], sensors, {"pad.E": Unknown()})
+        return Problem([replace(recording, **changes)], sensors, {"materials.gel.E": Unknown()})
 
     noisier = {channel: (t, y + 1e-9) for channel, (t, y) in recording.samples.items()}
     elsewhere = {"a": [Stage("all", (), (), 1e-4)]}
@@ -141,7 +140,7 @@ def test_laws_that_were_not_given_the_same_data_are_refused():
         ({}, {}, "needs two laws or more, not 1"),
         ({"b": other(name="two")}, {}, "`a` and `b` have other recordings: one and two"),
         ({"b": other(samples=noisier)}, {}, "`one` of the laws `a` and `b` has other samples"),
-        ({"b": other({"x_C": sensors["x_C"]})}, {}, "have other sensors"),
+        ({"b": other({"x_ellipse": Sensor(noise=1e-5)})}, {}, "have other sensors"),
         (
             {"b": other()},
             {"heldout": ["one"]},

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,13 +25,11 @@ from torchsoft.sysid.measured import STATED, load, stem, vocabulary
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
 
-SIGNALS = ("x_d", "y_d", "F_ff")
 LAW = "laws.steel_on_rubber"
 COULOMB = f"""[compare.coulomb.settings]
 {LAW}.friction = {{kind = "coulomb", mu_s = 0.8, mu_k = 0.7}}
 """
 KNOWN = vocabulary(PAPER.assemble(), {})
-MEASURED = measurable(PAPER.assemble())
 
 
 def rubber(kind: str, strengths: str) -> str:
@@ -201,14 +200,13 @@ def test_empty_cells_are_missing_samples(loaded):
 @pytest.fixture(scope="module")
 def run():
     """A grasp of 60 ms."""
-    strokes = {"kind": "strokes", "travel": 5e-3, "stroke_time": 0.3, "since": 0.05}
-    changes = {
-        "contact.v_s": 0.05, "control.senses": "bracket.x", "bodies.disc.start.x": 60.3e-3,
-        "bodies.bracket.start.x": 60.3e-3, "motion.x_d": strokes, "motion.y_d.times": [0.0, 0.05],
-        "motion.y_d.values": ["start", 49.1e-3], "motion.F_ff.times": [0.0, 0.05],
-        "motion.F_ff.values": [0.0, "held"],
-    }  # fmt: skip
-    return paper(changes).run(torch.linspace(0, 0.06, 31, dtype=torch.float64), step=2e-3)
+    motion = """
+x_d = {kind = "strokes", travel = 5e-3, stroke_time = 0.3, since = 0.05}
+y_d = {times = [0.0, 0.05], values = ["start", 49.1e-3]}
+F_ff = {times = [0.0, 0.05], values = [0.0, "held"]}
+"""
+    settings = tomllib.loads(CONFIG)["settings"] | {"motion": tomllib.loads(motion)}
+    return paper(**settings).run(torch.linspace(0, 0.06, 31, dtype=torch.float64), step=2e-3)
 
 
 def test_a_trajectory_file_is_a_recording(run, tmp_path):
@@ -218,10 +216,10 @@ def test_a_trajectory_file_is_a_recording(run, tmp_path):
     for without, tolerance in ([], 1e-12), (["y_d_dot"], 2e-4):
         save(run.to_xarray().drop_vars(without), tmp_path / "run.nc")
         (one,) = load([tmp_path / "run.nc"], tmp_path / "fit.toml").problem.recordings
-        for channel in MEASURED:
+        for channel in measurable(PAPER.assemble()):
             np.testing.assert_array_equal(one.samples[channel][1], run[channel].detach())
         with torch.no_grad():
-            got = one.rig.reference(run.t, SIGNALS).flatten(1)[:, :5]
+            got = one.rig.reference(run.t, ("x_d", "y_d", "F_ff")).flatten(1)[:, :5]
         np.testing.assert_allclose(got, desired, atol=tolerance)
 
 

@@ -42,28 +42,24 @@ class Case:
         return judge_residuals(parts, r, J, robust=robust)
 
     def fitted(self) -> tuple[list[Part], np.ndarray, np.ndarray]:
-        rng, known = np.random.default_rng(self.seed), []
+        rng, found, J, y = np.random.default_rng(self.seed), [], [], []
 
         def slow(*shape):
             return signal.lfilter(*signal.butter(2, 0.1), rng.standard_normal(shape), axis=0)[200:]
 
         for k, m in enumerate(self.lengths):
             for channel in CHANNELS:
-                reading = slow(m + 200)
+                t, reading = np.arange(m) * H, slow(m + 200)
                 e = rng.standard_normal(m) if self.noise is None else made(self.noise, m, rng)
                 raw = self.scale * e + self.fault.get((f"run {k}", channel), 0.0)
-                known.append(
-                    (f"run {k}", channel, np.arange(m) * H, reading, slow(m + 200, 4), raw)
-                )
-        whitened = lambda t, x: x if self.assumed is None else self.assumed.whitener(t) @ x
-        J = np.concatenate([whitened(t, j) for _, _, t, _, j, _ in known])
-        y = np.concatenate([whitened(t, raw) for _, _, t, _, _, raw in known])
-        x, ends = np.linalg.lstsq(J, y, rcond=None)[0], np.cumsum([len(one[2]) for one in known])
-        parts = [
-            Part(name, channel, t, np.arange(end - len(t), end), raw - j @ x, reading, self.assumed)
-            for end, (name, channel, t, reading, j, raw) in zip(ends, known)
-        ]
-        return parts, y - J @ x, J
+                j, rows = slow(m + 200, 4), np.arange(m) + sum(map(len, y))
+                W = np.eye(m) if self.assumed is None else self.assumed.whitener(t)
+                J.append(W @ j)
+                y.append(W @ raw)
+                found.append((Part(f"run {k}", channel, t, rows, raw, reading, self.assumed), j))
+        J, y = np.concatenate(J), np.concatenate(y)
+        x = np.linalg.lstsq(J, y, rcond=None)[0]
+        return [part._replace(raw=part.raw - j @ x) for part, j in found], y - J @ x, J
 
 
 def alarms(verdicts: list[ResidualTest], test: str) -> list[ResidualTest]:

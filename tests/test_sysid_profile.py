@@ -7,7 +7,6 @@ from closed_forms import WALL, ClosedForm, optimum
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.profile import profiles
 
-E, K_N = "materials.rubber.E", "laws.steel_on_rubber.K_n"
 STRAIGHT = np.random.default_rng(0).standard_normal((20, 3))
 Z95 = 1.959964
 """Of the normal distribution, the half width of the 95 % interval."""
@@ -78,3 +77,6 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters():
     assert product.formula == "E * K^0.4"
     assert seen(*np.eye(3).tolist()) == []  # all of them are seen
     assert seen([1, 0, 0]) == []  # K and R are not seen at all
+    J = np.array([[100, 2.4], [0, 0.05]])  # no coarse exponent of what is hardly known is as good
+    (fine,) = combinations(["E", "K"], np.linalg.inv(J.T @ J), 0.3)
+    assert fine.formula == "E * K^0.024"

@@ -47,23 +47,13 @@ PLAN = FIT.replace(
 )
 
 
-def coarse(**groups: Any) -> RigFile:
-    tips = {name: {"elements_x": 18} for name in ("left_tip", "right_tip")}
-    file = RigFile.from_toml(RIG).override(pads={"table": {"elements_x": 25}, **tips})
-    return file.override(**groups)
-
-
-def simulated(E: float, t: torch.Tensor, **how: Any) -> Any:
-    """The truth: the fingers close and lift the disc."""
-    loop = {"left_x": {"Kd": TRUTH["actuators.left_x.Kd"]}}
-    rig, y0, _ = coarse(materials={"silicone": {"E": E}}, actuators=loop).build()
-    return simulate(rig, t, y0=y0, **how)
-
-
 @pytest.fixture(scope="module")
 def run():
-    t = torch.linspace(0, 1.2, 241, dtype=torch.float64)
-    return simulated(TRUTH["materials.silicone.E"], t, rtol=1e-5)
+    """The truth: the fingers close and lift the disc."""
+    tips = {name: {"elements_x": 18} for name in ("left_tip", "right_tip")}
+    file = RigFile.ready("two_fingers").override(TRUTH, pads={"table": {"elements_x": 25}} | tips)
+    rig, y0, _ = file.build()
+    return simulate(rig, torch.linspace(0, 1.2, 241, dtype=torch.float64), y0=y0, rtol=1e-5)
 
 
 @pytest.fixture

@@ -17,8 +17,7 @@ from torchsoft.sysid.residual_tests import CLEAR, parts
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import FAULTS
 
-E, LAW = "materials.rubber.E", "laws.steel_on_rubber"
-MU_S, MU_K = f"{LAW}.friction.mu_s", f"{LAW}.friction.mu_k"
+E = "materials.rubber.E"
 NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta_C": 5e-4, "effort_x": 0.1, "v_x_Br": 1e-3}
 Signals = Mapping[str, Callable[..., np.ndarray]]
 
@@ -40,10 +39,9 @@ def strokes(dense):
 
 
 def low_pass(of: Signals, lag: float, t: np.ndarray) -> np.ndarray:
-    h, decay = 1e-5, np.exp(-1e-5 / lag)
-    s = np.arange(0.0, t[-1] + h, h)
-    y = of["x_C"](np.maximum(s - h / 2, 0.0))
-    return np.interp(t, s, signal.lfilter([1 - decay], [1, -decay], y, zi=[decay * y[0]])[0])
+    s = np.arange(0.0, t[-1] + 1e-4, 1e-4)
+    y = of["x_C"](s)
+    return y[0] + np.interp(t, s, signal.lsim(([1.0], [lag, 1.0]), y - y[0], s)[1])
 
 
 def play(of: Signals, width: float, t: np.ndarray) -> np.ndarray:

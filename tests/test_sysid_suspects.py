@@ -38,7 +38,7 @@ from torchsoft.sysid.search import best_of
 from torchsoft.sysid.suspect_findings import LIKELY, risk_findings, suspect_findings
 from torchsoft.sysid.suspect_findings import test_findings as findings_of_tests
 
-E, K_N, MU_S, MU_K = "materials.gel.E", "laws.dry.K_n", "contact.mu_s", "contact.mu_k"
+E, K_N, MU_K = "materials.gel.E", "laws.dry.K_n", "contact.mu_k"
 TRUTH = {E: 0.85e6, K_N: 1.3e5}
 SENSORS = {
     "x_ball": Sensor(noise=1e-5), "y_ball": Sensor(noise=2e-6),
@@ -149,7 +149,6 @@ def answers(tmp_path_factory):
 def test_nothing_speaks_against_what_is_right(answers):
     trusted, _, whole = answers
     assert whole.verdict == "holds"
-    assert {one.severity for one in whole.findings} <= {"note"}
     assert {one.code for one in whole.findings} <= {
         "undetectable",
         "untestable",

@@ -11,10 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
-
-import pytest
 
 import torchsoft
 
@@ -65,29 +62,6 @@ def alive(pid: int) -> bool:
     return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
 
-class Torn:
-    """A file opened for writing: each `write` may be the last operation, half done."""
-
-    def __init__(self, file: Any, tick: Callable[[], bool]) -> None:
-        self._file, self._tick = file, tick
-
-    def write(self, data: Any) -> int:
-        if self._tick():
-            self._file.write(data[: len(data) // 2])
-            self._file.flush()
-            os._exit(DIED)
-        return self._file.write(data)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-    def __enter__(self) -> "Torn":
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._file.close()
-
-
 def performed(
     function: Callable[[], Any], folder: Path, last: int | None = None
 ) -> tuple[int, list[str]]:
@@ -120,8 +94,18 @@ def performed(
 
         def torn(file: Any, mode: str = "r", *others: Any, **more: Any) -> Any:
             got = opened(file, mode, *others, **more)
-            writes = set(mode) & set("wax+")
-            return Torn(got, lambda: tick("half a write", file)) if writes else got
+            whole = got.write
+
+            def write(data: Any) -> int:
+                if tick("half a write", file):
+                    whole(data[: len(data) // 2])
+                    got.flush()
+                    os._exit(DIED)
+                return whole(data)
+
+            if set(mode) & set("wax+"):
+                got.write = write
+            return got
 
         os.fsync = fsync
         io.open = builtins.open = torn
@@ -135,17 +119,6 @@ def performed(
 
 # folders
 # ----------------------------------------------------------------------
-
-
-@pytest.fixture
-def memory(tmp_path):
-    """A folder that is flushed at once, where there is one: waiting for a disk would take most of
-    the trial's time."""
-    if os.access("/dev/shm", os.W_OK):
-        with TemporaryDirectory(dir="/dev/shm") as folder:
-            yield Path(folder)
-    else:
-        yield tmp_path
 
 
 def tree(folder: Path) -> dict[str, bytes | None]:

@@ -1,7 +1,6 @@
 """Small rigs, runs, recordings and datasets, quick enough to be made hundreds of times."""
 
 import csv
-import io
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -118,9 +117,6 @@ def rigs() -> list[dict[str, Any]]:
     return [file.model_dump(mode="json", exclude_unset=True) for file in files]
 
 
-Table = list[list[str]]
-
-
 def dataset(folder: Path, trajectories: int = 3) -> Path:
     """A file that describes a small dataset."""
     path = folder / f"small-{trajectories}.toml"
@@ -162,13 +158,11 @@ def problem() -> Problem:
     return Problem([recorded], sensors, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()})
 
 
-def cells(rows: int = 42) -> Table:
+def cells(rows: int = 42) -> list[list[str]]:
     """The heading and first rows of the example's recording, 0.2 s."""
     with (EXAMPLE / "rolling.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.reader(file))[:rows]
 
 
-def csv_text(table: Table, delimiter: str = ",") -> str:
-    out = io.StringIO()
-    csv.writer(out, delimiter=delimiter, lineterminator="\n").writerows(table)
-    return out.getvalue()
+def csv_text(table: list[list[str]]) -> str:
+    return "".join(",".join(row) + "\n" for row in table)

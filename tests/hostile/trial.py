@@ -11,19 +11,15 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import chain
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 SCALE = float(os.environ.get("HOSTILE_SCALE", "1"))
 SEED = int(os.environ.get("HOSTILE_SEED", "0"))
 LIMIT = 20.0
 """Most processor time [s] that one call may take, so that nothing hangs."""
-ATTACKS = "attacks"
-"""Under this name a test reports how many attacks it tried, and how many did not hold."""
 
 
 class Late(BaseException):
@@ -95,22 +91,3 @@ def count(number: int) -> int:
 def random(name: str, number: int = 0) -> np.random.Generator:
     """A generator of its own for every name and number, the same in every trial of one seed."""
     return np.random.default_rng([SEED, number, *name.encode()])
-
-
-@pytest.fixture
-def tally(record_property):
-    """Counts the attacks of a test, which fails if any of them did not hold."""
-    made = Tally()
-    yield made
-    record_property(ATTACKS, (made.tried, len(made.broken)))
-    assert made.tried, "nothing was tried"
-    assert not made.broken, f"{len(made.broken)} did not hold, the first: {made.broken[0]}"
-
-
-def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """A line for every test that counts attacks."""
-    for report in chain.from_iterable(terminalreporter.stats.values()):
-        for name, value in getattr(report, "user_properties", ()):
-            if name == ATTACKS:
-                line = f"{report.nodeid}: tried {value[0]}, not held {value[1]}"
-                terminalreporter.write_line(line)
