@@ -7,7 +7,30 @@ from rig_tester import at_random
 from test_every_rig import RIGS
 
 from torchsoft.physics.contact import turned
-from torchsoft.physics.multibond import to_dot, topology
+from torchsoft.physics.multibond import net_efforts, to_dot, topology
+
+
+@torch.no_grad()
+def test_the_moment_on_the_bracket_is_that_of_the_bonded_nodes():
+    """Eq. 35: the sum over bonded nodes of r x F, plus that of the displacements with the forces on
+    the nodes that move, which linear elasticity leaves out."""
+    model = coarse(pad__inertial=True)
+    state = model.unpack(random_state(model, 3))
+    graph = model.evaluate(0.0, state)
+    moment = float(net_efforts(graph.ports, model.junctions)["bracket_spin"])
+    pad, u = model.pads["U"], model.displacement("U", state)
+    mesh, material, axes = pad.mesh, pad.material, pad.axes
+    port = graph.ports["pad_U"]
+    strain = u + material.chain()[1] * port.transformer.flow(graph.flows)
+    lame_lambda, lame_mu = (x.item() for x in pad.factors()[2:])
+    displaced = torch.zeros(len(mesh.nodes), 2, dtype=torch.float64)
+    displaced[torch.from_numpy(mesh.free)] = strain @ axes
+    K = material.depth.item() * mesh.stiffness(lame_lambda, lame_mu, all_nodes=True)
+    force = torch.from_numpy(K @ displaced.flatten().numpy()).reshape(-1, 2) @ axes.mT
+    bonded, base = torch.from_numpy(mesh.bonded), torch.from_numpy(pad.placed(mesh.nodes))
+    cross = lambda r, F: float((r[:, 0] * F[:, 1] - r[:, 1] * F[:, 0]).sum())
+    expected = cross(base[bonded], -force[bonded]) + cross(u, port.effort)
+    assert moment == pytest.approx(expected, rel=1e-9)
 
 
 @torch.no_grad()
