@@ -25,6 +25,7 @@ from conftest import coarse as build
 from fem_oracle import matrices
 from torch import Tensor
 
+from experiments.validation.half_plane import HalfPlane, hertz
 from torchsoft import (
     PD,
     Actuator,
@@ -409,3 +410,8 @@ def test_the_full_grasp_converges_with_the_mesh_and_the_penalty():
     coarse_mesh, stiff = grasped(60, 1.0)[0], grasped(120, 4.0)[0]
     assert usual + (usual - coarse_mesh) / 3 == pytest.approx(70.54, rel=2e-3)
     assert stiff + (stiff - usual) / 3 == pytest.approx(79.33, rel=5e-3)
+
+
+def test_springs_far_stiffer_than_their_pad_have_an_equilibrium():
+    """Forces do not have the rounding of places [m] times the stiffness of the springs [N/m]."""
+    assert hertz(HalfPlane(elements=5, springs=400.0))["Hertz: p_0"] == pytest.approx(0.0, abs=0.03)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import f64
-from hostile.specimens import coarse
 
 from torchsoft import BuiltRig, RigFile
 from torchsoft.rigs.excite import CATALOGUE, GRIP, OFF_NODE, SINCE, Excitation, excite
@@ -16,7 +15,13 @@ RIGS = (
     "light_grasp",
     *(pytest.param(name, marks=pytest.mark.slow) for name in ("ellipse", "rounded_box")),
 )
+COARSE = {"elements_x": 40, "elements_y": 1}
 ROLL = {"kind": "profile", "times": [0.5, 0.8], "values": [0.0, 4e-3], "offset": "start"}
+
+
+def coarse(name: str) -> RigFile:
+    file = RigFile.ready(name)
+    return file.override(pads=dict.fromkeys(file.pads, COARSE))
 
 
 def followed(built: BuiltRig, *times: float) -> dict[str, list[float]]:

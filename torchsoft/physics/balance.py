@@ -130,12 +130,17 @@ def contact_forces(
 ) -> tuple[Tensor, float]:  # fmt: skip
     """Forces N^T f (..., nodes, 2) [N] of a law at the contact points of a condensed pad (see
     `Points`), and the largest residual that is left, from the forces `first` (..., points, 2) on,
-    none by default."""
+    none by default.
+
+    The last iteration takes the law's forces along its slopes: forces of the law at the points
+    found would have an error of its stiffness times the rounding of the points."""
     points = Points(A, N, free, law)
     x, solve, left = newton(
         points, N @ free if first is None else points.moved(first), tolerance, iterations
     )
-    return N.mT @ law(corrected(points, x, solve)), left
+    f = law(x)
+    way = solve(points.moved(f) - x)
+    return N.mT @ (f + (slopes_at_points(law, x) @ way[..., None])[..., 0]), left
 
 
 class Banded:
