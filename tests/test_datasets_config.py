@@ -56,6 +56,9 @@ MISTAKES = [
      "mu_k.ratio_to: `laws.dry.mu` is not in the"),
     ('parameters."materials.rubber.E" = '
      '{low = 0.3, high = 0.7, ratio_to = "laws.dry.friction.mu_k"}', "mu_k is a ratio itself"),
+    ('parameters."bodies.disc.start.x" = {low = 0.0595, high = 0.0605}\n'
+     'parameters."bodies.bracket.start.x" = {choices = [1e5], ratio_to = "bodies.disc.start.x"}',
+     r"parameters.bodies.bracket.start.x.choices.0 = 100000: impossible"),
     (f'parameters."pads.upper.elements_x" = {SPAN}',
      "the same in every trajectory; set it in `fix"),
     ('parameters."pads.upper.length" = {low = 70e-3, high = 80e-3}',

@@ -59,12 +59,14 @@ class Drawn(NamedTuple):
 
     def _check_ends(self, names: set[str]) -> None:
         """Raises `ValueError` where the rig file is impossible: as it is; with each bound of the
-        distributions with these names, the other parameters as the file states them but for the
-        ratios that it is in; and with all parameters at their medians."""
+        distributions with these names, ratios first, since they are in the values of others; the
+        other parameters as the file states them but for the ratios that it is in; and with all
+        parameters at their medians."""
         parameters, within = self.parameters, f"{self.where}parameters"
         if reason := self._unlike({}):
             raise ValueError(f"{f'{self.where}fixed' if self.where else 'rig'}: {reason}")
-        for name in parameters.keys() & names:
+        ratios_first = sorted(parameters, key=lambda name: parameters[name].ratio_to is None)
+        for name in (name for name in ratios_first if name in names):
             related = {name, parameters[name].ratio_to}
             related |= {one for one in parameters if parameters[one].ratio_to == name}
             moves = place(self.file, name).keys[0] == "motion"
