@@ -49,7 +49,22 @@ POINT = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("contact", "most"), LAWS.values(), ids=LAWS)
+EVERY = pytest.mark.parametrize(("contact", "most"), LAWS.values(), ids=LAWS)
+
+
+@EVERY
+def test_forces_are_continuous_at_touch_down(contact, most):
+    """They grow from zero with the springs, whatever the speed."""
+    for g in (1e-9, 1e-12):
+        got, apart = (at(contact, depth, 0.2, 0.3, 1e-5) for depth in (g, -g))
+        grown = 3 * float(contact.spring(f64(g)).detach()) + 0.02 * g / 1e-6
+        assert abs(float(got.F_N)) <= grown
+        assert abs(float(got.F_T)) <= most * grown + 1e-13
+        assert float(apart.F_N) == float(apart.F_T) == 0.0
+        assert abs(float(got.s_dot - apart.s_dot)) <= most * grown / (R / 2) + 1e-12
+
+
+@EVERY
 @settings(max_examples=30, derandomize=True, deadline=None)
 @given(**POINT)
 def test_power_is_balanced_friction_is_bounded_and_has_no_direction(

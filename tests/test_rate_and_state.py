@@ -1,4 +1,4 @@
-"""Rate-and-state friction: velocity steps and rests as in textbooks."""
+"""Rate-and-state friction: velocity steps, rests and sliders as in textbooks."""
 
 import tomllib
 from typing import Any
@@ -156,3 +156,62 @@ def test_the_age_of_a_contact_starts_at_touch_down(friction):
     lowest[300].backward()
     by_height = -0.05 * (20e-3 - 19.9e-3) / 0.12e-3**2
     assert float(heights.grad[0]) == pytest.approx(by_height, rel=0.1)
+
+
+SLIDER_MASS, G, SPEED = 1.0, 9.81, 1e-3
+CRITICAL = (B - A) * SLIDER_MASS * G / D_C
+
+
+def rates_of(k: float) -> complex:
+    """Rate of growth and frequency [1/s] of a slider on a spring k [N/m] of steady slip, for one
+    age: u' = V - v, m v' = k u - F_N (mu_v dv + mu_theta dtheta), theta' = 1 - v theta / D_c."""
+    theta = D_C / SPEED
+    J = np.array([
+        [0.0, -1.0, 0.0],
+        [k / SLIDER_MASS, -G * A / SPEED, -G * B / theta],
+        [0.0, -theta / D_C, -SPEED / D_C],
+    ])  # fmt: skip
+    return max(np.linalg.eigvals(J), key=lambda rate: rate.imag)
+
+
+@pytest.mark.parametrize(
+    "ratio", [1.3, *(pytest.param(ratio, marks=pytest.mark.slow) for ratio in (1.1, 1.5))]
+)
+def test_a_spring_slider_is_as_stable_as_linear_theory_has_it(ratio):
+    """Over ten nodes, whose points begin with an old age; k_c is that of the mass too,
+    1.17 (b - a) F_N / D_c. A thousandth of the age is the disturbance, in a run along the same
+    steps."""
+    tree = sled(theta_0=100.0).model_dump(exclude_unset=True)
+    tree["bodies"]["block"] = {
+        "mass": SLIDER_MASS, "theta": 0.0, "start": {"x": 0.0, "v_x": SPEED, "y": "rest"},
+        "shape": {"kind": "circle", "radius": 0.1},
+    }  # fmt: skip
+    tree["pads"]["track"] |= {"origin": [-64e-3, 0.0], "length": 140e-3, "elements_x": 140}
+    tree["laws"]["dry"]["K_n"] = 1e4
+    tree["actuators"] = {"spring": {"pushes": "block.x", "setpoint": "pull", "Kp": 1.0, "Kd": 0.0}}
+    tree["motion"] = {"pull": {"kind": "hold", "value": 0.0}}
+    built = RigFile.from_tree(tree).build()
+
+    def pulled(k: float, start: torch.Tensor, x: float, end: float, **how: Any) -> Trajectory:
+        with torch.no_grad():
+            built.rig.parameter("actuators.spring.Kp").fill_(k)
+        t = torch.arange(0.0, end + 1e-9, 5e-3, dtype=torch.float64)
+        way = Lines(np.array([0.0, end]), np.array([x, x + SPEED * end]))
+        return simulate(built.rig, t, y0=start, reference=Reference(pull=way), **how)
+
+    ahead = steady(SPEED) * SLIDER_MASS * G / (3 * CRITICAL)
+    first = pulled(3 * CRITICAL, built.y0, ahead, 1.0, rtol=1e-4)
+    ahead = float(first.force["track"][-1, :, 1].sum().abs()) / (ratio * CRITICAL)
+    start, x = first.y[-1], float(first["x_block"][-1]) + ahead
+    run = pulled(ratio * CRITICAL, start, x, 10.0, rtol=1e-4)
+    other = start.clone()
+    other[built.rig.layout.slices["friction", "track"]] *= 1 + 1e-3
+    changed = pulled(ratio * CRITICAL, other, x, 10.0, knots=run.knots)
+    expected = rates_of(ratio * CRITICAL)
+    dx, dv = ((changed[name] - run[name]).numpy() for name in ("x_block", "v_x_block"))
+    late = run.t.numpy() >= 1.0
+    size = np.log(np.hypot(abs(expected) * dx[late], dv[late]))
+    growth = np.polyfit(run.t.numpy()[late], size, 1)[0]
+    assert growth == pytest.approx(expected.real, rel=0.05)
+    force = run.force["track"].sum(1)
+    assert float((force[:, 1] / force[:, 0]).mean()) == pytest.approx(steady(SPEED), abs=5e-5)

@@ -3,6 +3,7 @@
 import importlib
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -88,3 +89,21 @@ def test_odeint_adjoint_of_a_forgotten_run_says_so():
         odeint(model, y0 + 1e-6 * shift, t, method=METHOD)
     with pytest.raises(RuntimeError, match="not among the last 4"):
         y.sum().backward()
+
+
+def test_the_continuous_adjoint_agrees_on_a_short_window():
+    """0.1 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the
+    discrete adjoint; it warns that it integrates backwards, and only then."""
+    model, t = coarse(pad__elements_x=30, pad__elements_y=1), times(1e-4, 2)
+    names = ("contact.K_t", "contact.R_t", "contact.K_n", "pad.E", "disc.mass")
+    y0, results = grasped(model, (5e-4, 0.0)), []
+    for solve, warns in (
+        (lambda y: odeint_adjoint(model, y, t, method="rk4", options={"step_size": 2.5e-5}), True),
+        (lambda y: odeint(model, y, t, method=METHOD, options={"step_size": 1e-6}), False),
+    ):
+        spin = model.unpack(solve(y0.clone().requires_grad_())).velocity["disc"][:, 2].sum()
+        backwards = pytest.warns(UserWarning, match='integrated backwards.*method="sdirk2"')
+        with backwards if warns else nullcontext():
+            results.append(torch.autograd.grad(spin, [*map(model.parameter, names)]))
+    for name, continuous, discrete in zip(names, *results):
+        assert abs(float(continuous - discrete)) < 1e-4 * abs(float(discrete)), name
